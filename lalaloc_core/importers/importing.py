@@ -81,26 +81,20 @@ class Format:
     keys: frozenset[str] = frozenset()
     extra: str = "plans"
 
-    def read(self, source: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-        """Return the plans in a file, one per storey, lowest first.
+    def call(self, function: Literal["read", "write"], *arguments: Any) -> Any:
+        """Return the plans that the format's module reads from a file, or the file that it writes.
 
         Raises:
             InvalidFloorPlanError: the file is invalid or exceeds a limit.
             MissingExtraError: a library of the format is not installed.
         """
-        return self._call("read", "reading", source, options, budget)
-
-    def write(self, document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
-        """Return a plan as a file of this format."""
-        return self._call("write", "writing", document, anchor)
-
-    def _call(self, function: str, activity: str, *arguments: Any) -> Any:
         try:
             module = import_module(f"lalaloc_core.importers.formats.{self.name}")
             return getattr(module, function)(*arguments)
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] in ("", "lalaloc_core"):
                 raise
+            activity = "reading" if function == "read" else "writing"
             raise MissingExtraError(f"{activity} {self.title}", self.extra) from error
 
 
@@ -177,7 +171,7 @@ def import_plans(
         budget.begin("opening the file")
         format, source = _open(content, limits)
         budget.begin(f"reading {format.title}")
-        plans = format.read(source, options, budget)
+        plans = format.call("read", source, options, budget)
     except RecursionError as error:
         raise InvalidFloorPlanError(
             f"the file is nested too deep; the limit is {limits.max_depth} levels (max_depth)"
@@ -254,13 +248,10 @@ def import_if_native(
     if not is_json(content):
         return None
     document = read_json(content, limits.max_depth, limits.max_json_values)
-    format = _json_format(document)
-    if format.name != "native" or PLANS in document:
+    if _json_format(document).name != "native" or PLANS in document:
         return None
-    (plan,) = format.read(document, options, Budget(limits))
-    if building is not None and "name" not in plan.document:
-        plan = _rename(plan, building)
-    return _with_option_warnings(plan, format, options)
+    (plan,) = import_plans(content, options, limits, building=building)
+    return plan
 
 
 def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> bytes:
@@ -270,7 +261,7 @@ def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> b
     """
     if format not in EXPORT_FORMATS:
         raise InvalidFloorPlanError(f"format is '{format}'; set it to one of {', '.join(EXPORT_FORMATS)}")
-    return FORMATS[format].write(plan.to_dict(), anchor or plan.anchor)
+    return FORMATS[format].call("write", plan.to_dict(), anchor or plan.anchor)
 
 
 def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) -> str:

@@ -18,14 +18,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import Layouts, MatchingConfig, MatchingCost
 from lalaloc_core.localise.match.cost_terms import class_losses, precisions
 from lalaloc_core.localise.match.pose_grid import SeenThrough
-from lalaloc_core.localise.query import (
-    CameraHeight,
-    PredictedCeiling,
-    PredictedOpenings,
-    PredictedProfile,
-    PredictedRoomType,
-    Query,
-)
+from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.query.query import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType
 from tests.strategies import seeds
 
 CONFIG = MatchingConfig()

@@ -15,30 +15,14 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import Bundle, ConfidenceModel
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.belief import (
-    GridCosts,
-    Posterior,
-    Support,
-    area_shares,
-    pose_uncertainty,
-    probability_map,
-    signals_of,
-)
-from lalaloc_core.localise.belief.confidence import Signals, marginal_information
+from lalaloc_core.localise.belief import GridCosts, Posterior, Support, area_shares, pose_uncertainty, probability_map
+from lalaloc_core.localise.belief.confidence import Signals, marginal_information, signals_of
 from lalaloc_core.localise.belief.posterior import weighted_places
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, PoseGrid
-from lalaloc_core.localise.query import (
-    NO_HINTS,
-    CameraHeight,
-    Candidate,
-    Hints,
-    Near,
-    PredictedProfile,
-    Query,
-    rooms_named,
-)
+from lalaloc_core.localise.query import NO_HINTS, CameraHeight, Candidate, Hints, Near, PredictedProfile, Query
+from lalaloc_core.localise.query.hints import rooms_named
 from lalaloc_core.localise.refine.latent_refiner import PoseRefiner
 from lalaloc_core.localise.search.pipeline import Localisation, Refine, localise
 from lalaloc_core.localise.search.retrieval import grid_costs

@@ -18,15 +18,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid, layouts_at
 from lalaloc_core.localise.match.coarse_pass import CoarseTable, coarse_costs
 from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
-from lalaloc_core.localise.query import (
-    CameraHeight,
-    PredictedCeiling,
-    PredictedOpenings,
-    PredictedProfile,
-    PredictedRoomType,
-    Query,
-    rolled,
-)
+from lalaloc_core.localise.query import CameraHeight, Query, rolled
+from lalaloc_core.localise.query.query import PredictedCeiling, PredictedOpenings, PredictedProfile, PredictedRoomType
 from lalaloc_core.localise.venue.index_search import DividedIndex, PlanSearch, SearchLimits
 from lalaloc_core.localise.venue.index_segment import CodeScan, lookup_tables, product_codes
 from lalaloc_core.localise.venue.merged_plans import MergedPlans

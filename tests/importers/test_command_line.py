@@ -133,9 +133,7 @@ def test_every_level_is_written_to_a_folder(file: Path, tmp_path: Path, capsys: 
         ("encode kitchen.features", "'kitchen.features' is read"),
     ],
 )
-def test_no_file_is_overwritten_unasked(
-    arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_file_is_overwritten(arguments: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for name in ("attic.json", "home-1.json", "keep.svg", "kitchen.features"):
         (tmp_path / name).write_text(_two_levels(), encoding="utf-8")
     for path in FAULTS.glob("ros_glass.*"):

@@ -37,9 +37,8 @@ def test_largest_of_several_storeys_is_read_and_the_others_are_named():
     (warning,) = (warning for warning in plan.report.warnings if "storeys seem to be drawn" in warning)
     assert "this plan is 'Storey 1'" in warning
     crop = warning.split("m² at crop=")[2].split(";")[0]
-    other = import_plan(
-        picture_file(_storeys()), ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
-    )
+    options = ImportOptions.from_text({"metres_per_pixel": str(SCALE), "crop": crop})
+    other = import_plan(picture_file(_storeys()), options)
     (room,) = shapes(other.document)
     assert room.area == pytest.approx(15.6, abs=0.5)
     # Coordinates stay those of the whole picture.
@@ -51,6 +50,8 @@ def test_every_storey_of_a_picture_is_a_level():
     left, right = import_plans(picture_file(_storeys()), ImportOptions.from_text(options), building="House")
     assert (left.document["name"], right.document["name"]) == ("House – Storey 1", "House – Storey 2")
     assert left.report.levels == right.report.levels == ("Storey 1", "Storey 2")
+    # The doorway of the first storey is said of it alone.
+    assert [sum("taken for a passage" in line for line in plan.report.unsure) for plan in (left, right)] == [1, 0]
     chosen = import_plan(picture_file(_storeys()), ImportOptions.from_text({**options, "level": "Storey 2"}))
     assert chosen.document["rooms"] == right.document["rooms"]
 
@@ -67,10 +68,9 @@ def test_storeys_are_apart_where_no_wall_joins_them(gap_px: int, count: int):
 def test_storeys_have_the_levels_of_their_titles():
     rooms = [SketchedRoom(shapely.box(0.0, y, 6.0, y + 4.0)) for y in (0.0, 6.0, 12.0)]
     texts = {"FIRST FLOOR": (-3.0, 2.0), "Ground floor": (-3.0, 8.0), "Loft": (3.0, 14.0), "Garage": (-3.0, 14.0)}
-    letterings = [Lettering(text, position) for text, position in texts.items()]
-    plans = assemble_storeys(
-        Sketch(rooms=rooms), letterings, ReportBuilder("picture"), ImportOptions(), Budget(), lambda box: box
-    )
+    titles = [Lettering(text, position) for text, position in texts.items()]
+    sketch = Sketch(rooms=rooms)
+    plans = assemble_storeys(sketch, titles, ReportBuilder("picture"), ImportOptions(), Budget(), lambda box: box)
     found = [(plan.level.name, plan.level.number) for plan in plans if plan.level is not None]
     assert sorted(found, key=str) == [("FIRST FLOOR", 1.0), ("Ground floor", 0.0), ("Storey 1", None)]
 

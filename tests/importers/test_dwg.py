@@ -57,9 +57,7 @@ def test_drawing_is_converted_by_libredwg(flat: FloorPlan, tmp_path: Path):
     ("name", "script"),
     [("dwg2dxf", 'cp {dxf} "$3"'), ("ODAFileConverter", '[ -f "$1/plan.dwg" ] && cp {dxf} "$2/plan.dxf"')],
 )
-def test_converter_is_called_with_its_arguments(
-    programs: Path, flat: FloorPlan, tmp_path: Path, name: str, script: str
-):
+def test_converter_gets_its_arguments(programs: Path, flat: FloorPlan, tmp_path: Path, name: str, script: str):
     drawing = tmp_path / "flat.dxf"
     drawing.write_bytes(export_plan(flat, "dxf"))
     _install(programs, script.format(dxf=drawing), name)

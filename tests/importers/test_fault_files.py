@@ -1,15 +1,19 @@
-"""Small files with the traits of real ones: each is read right, or refused with a remedy."""
+"""Small files with traits of real ones: read right, or refused with a remedy; `test_floorplans.py` sends them, too."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import import_plan, import_plans
+from lalaloc_core.cli import main
+from lalaloc_core.importers import import_plans
 from tests.importers.conftest import shapes, zip_file
 
 FOLDER = Path(__file__).parent / "faults"
@@ -17,12 +21,23 @@ FOLDER = Path(__file__).parent / "faults"
 
 @dataclass(frozen=True)
 class _Expected:
-    """Rooms by area (m²), openings by kind (None: any), types of rooms, and a text of the report."""
+    """Rooms by area (m²), openings by kind (None: any), types of rooms, a text of the report, and options."""
 
     areas_m2: tuple[float, ...]
     openings: dict[str, int] | None = None
     types: frozenset[str] = field(default_factory=frozenset)
     said: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
+
+    def check(self, document: dict[str, Any], report: Mapping[str, Any]) -> None:
+        """Check a plan that was read, and the report on it."""
+        areas_m2 = sorted((room.area for room in shapes(document)), reverse=True)
+        assert areas_m2 == pytest.approx(sorted(self.areas_m2, reverse=True), abs=0.06)
+        if self.openings is not None:
+            assert Counter(opening["kind"] for opening in document.get("openings", ())) == self.openings
+        assert self.types <= {room.get("type") for room in document["rooms"]}
+        lines = (*report["notes"], *report["warnings"], *report["unsure"], report["scale_source"], "")
+        assert any(self.said in line for line in lines)
 
 
 _DOOR_AND_WINDOW = {"door": 1, "window": 1}
@@ -46,6 +61,7 @@ EXPECTED = {
     "low_attic.ifc": _Expected((19.2, 16.0), said="room 'Eaves' (34.2 m², 100 % of the floor) is 1.20 m high"),
     "low_cell.gml": _Expected((20.0,), said="room 'Store' (3.6 m², 15 % of the floor) is 1.25 m high"),
     "low_cupboard.ifc": _Expected((19.2, 16.0), said="'Understairs' (2.4 m², 6 % of the floor) is 1.30 m high"),
+    "metres.png": _Expected((26.4, 18.8)),
     "mline_walls.dxf": _Expected((25.1, 18.2), {"door": 1}),
     "open_outlines.geojson": _Expected((24.0, 19.2, 41.8), said="the open outline of 'Office' was closed"),
     "outlines.ifc": _Expected((24.0, 15.2), said="space 'Living' is 0.00 m high"),
@@ -72,11 +88,14 @@ EXPECTED = {
     "stepped_hall.ifc": _Expected((54.0, 12.0)),
     "thick_closed_outer.svg": _Expected(_FLAT_OF_FOUR, {"passage": 3}),
     "thick_closed_outer_control.svg": _Expected(_FLAT_OF_FOUR, {"passage": 3}),
+    "transparent.png": _Expected((26.6, 18.9), options={"metres_per_pixel": "0.0125"}),
     "valetudo.json": _Expected((26.9, 19.3), {"passage": 1}, frozenset({"living", "bedroom"})),
+    "valetudo.png": _Expected((26.9, 19.3), {"passage": 1}, frozenset({"living", "bedroom"})),
     "views.svg": _Expected((20.0, 20.0, 15.0, 11.2, 5.0)),
     "wall_body_grey.svg": _Expected((23.5, 23.5)),
     "wall_body_pier.svg": _Expected((23.5, 22.5)),
     "wall_body_thin.svg": _Expected((23.5, 23.5)),
+    "white_on_transparent.png": _Expected((26.6, 18.9), options={"metres_per_pixel": "0.0125"}),
     "wide_walls.dxf": _Expected((23.9, 17.2), {"door": 1}),
 }
 REFUSED = {
@@ -92,38 +111,30 @@ REFUSED = {
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] if name == "right_a1.pdf" else []) for name in EXPECTED]
 )
-def test_file_is_read_right(name: str):
-    expected = EXPECTED[name]
-    plan = import_plan(content_of(name))
-    assert sorted((room.area for room in shapes(plan.document)), reverse=True) == pytest.approx(
-        sorted(expected.areas_m2, reverse=True), abs=0.06
-    )
-    if expected.openings is not None:
-        assert Counter(opening["kind"] for opening in plan.document.get("openings", ())) == expected.openings
-    assert expected.types <= {room.get("type") for room in plan.document["rooms"]}
-    report = plan.report
-    lines = (*report.notes, *report.warnings, *report.unsure, report.scale_source, "")
-    assert any(expected.said in line for line in lines)
+def test_file_is_read_right(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    expected, out = EXPECTED[name], tmp_path / "plan.json"
+    options = [part for key, value in expected.options.items() for part in (f"--{key.replace('_', '-')}", value)]
+    assert main(["plan", "import", str(FOLDER / name), "--out", str(out), *options]) == 0
+    expected.check(json.loads(out.read_bytes()), json.loads(re.sub(r"^level .*?: ", "", capsys.readouterr().err)))
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_file_is_refused_with_a_remedy(name: str):
-    with pytest.raises(InvalidFloorPlanError, match=REFUSED[name]):
-        import_plan(content_of(name))
+def test_file_is_refused_with_a_remedy(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    # The command line writes a plan of each level.
+    code = 0 if name == "levels_by_layer.dxf" else 2
+    assert main(["plan", "import", str(FOLDER / name), "--out", str(tmp_path / "plan.json")]) == code
+    assert re.search(REFUSED[name], capsys.readouterr().err, re.DOTALL)
 
 
 def test_storeys_on_layers_of_their_own_are_plans():
     plans = import_plans(content_of("levels_by_layer.dxf"))
     assert [plan.level and plan.level.name for plan in plans] == ["EG", "OG"]
+    assert [any("OG" in use.layer for use in plan.report.layers) for plan in plans] == [False, True]
     assert [round(sum(room.area for room in shapes(plan.document)), 1) for plan in plans] == [79.9, 79.9]
 
 
-def test_picture_of_a_robots_map_has_the_map():
-    assert import_plan(content_of("valetudo.png")).document == import_plan(content_of("valetudo.json")).document
-
-
 def test_every_file_is_expected():
-    names = {path.name for path in FOLDER.iterdir() if path.suffix != ".png"}
+    names = {path.name for path in FOLDER.iterdir()} - {"ros_glass.png"}
     assert names == EXPECTED.keys() | REFUSED.keys()
 
 

@@ -139,6 +139,18 @@ def test_openings_painted_over_walls_of_an_svg_are_found():
     assert [len(lines(plan.document, kind)) for kind in ("door", "window", "passage")] == [1, 1, 1]
 
 
+@pytest.mark.parametrize("plot", ["M-700 -600L1500 -500L1800 1200L-400 1000Z", "M-700 -600H1500V1000H-700Z"])
+@pytest.mark.parametrize(("name", "count"), [("Bed", 2), ("", 2), ("Garden", 2), ("Hall", 3)])
+def test_plot_around_walls_is_no_room_unless_its_name_is(plot: str, name: str, count: int):
+    rings = ("M0 0H1000V600H0Z", "M20 20H490V580H20Z", "M510 20H980V580H510Z", plot)
+    walls = [f'<path class="wall" fill="none" stroke="#000" d="{ring}"/>' for ring in rings]
+    plan = _svg(*walls, f'<text x="{600 if name == "Bed" else 1100}" y="300">{name}</text>')
+    assert len(plan.document["rooms"]) == count
+    assert any("is taken for the plot" in line for line in plan.report.unsure) == (count == 2)
+    single = _svg(walls[0], walls[3], walls[1].replace("M20 20H490V580H20Z", "M490 0V600")).report
+    assert any("m² without a name lies around all others" in line for line in single.warnings)
+
+
 def test_floors_painted_over_the_edges_of_walls_are_no_openings():
     floors = [f'<rect x="{x}" y="10" width="485" height="580" fill="#eee"/>' for x in (10, 505)]
     plan = _svg(_WALLS, *floors)
@@ -204,14 +216,18 @@ def test_room_behind_glass_of_a_turned_map_is_found(turn_deg: float, rows: tuple
 
 
 def _storeys(*layers: str, offset: float = 0.0) -> dict[str, ImportedPlan]:
-    """Return the storeys of a drawing with a wall of 8 x 6 m, each inside the last, and a partition, on each layer."""
+    """Return the storeys of a drawing with a wall of 8 x 6 m, each inside the last, and a partition, on each layer.
+
+    A layer can have a height: "WALL@3".
+    """
     document: Any = new_dxf("R2010", units=6)
-    for number, layer in enumerate(layers):
+    for number, (layer, _, height) in enumerate(layer.partition("@") for layer in layers):
+        at = {"layer": layer, "elevation": float(height or 0.0)}
         for inner in (offset * number, offset * number + 0.3):
             ring = [(inner, inner), (8.0 - inner, inner), (8.0 - inner, 6.0 - inner), (inner, 6.0 - inner)]
-            document.modelspace().add_lwpolyline(ring, close=True, dxfattribs={"layer": layer})
+            document.modelspace().add_lwpolyline(ring, close=True, dxfattribs=at)
         for x in (3.0 + number, 3.2 + number):
-            document.modelspace().add_line((x, 0.3), (x, 5.7), dxfattribs={"layer": layer})
+            document.modelspace().add_lwpolyline([(x, 0.3), (x, 5.7)], dxfattribs=at)
     plans = import_plans(dxf_file(document))
     return {plan.level.name if plan.level else "": plan for plan in plans}
 
@@ -229,6 +245,8 @@ def _storeys(*layers: str, offset: float = 0.0) -> dict[str, ImportedPlan]:
         (("WALL_0", "EG-Wand", "OG-Wand"), ("EG", "OG")), (("EG-Wand", "WALL_0", "OG-Wand"), ("EG", "OG")),
         (("2_WALL", "1_WALL"), ("1", "2")), (("Walls 01", "Walls 02"), ("01", "02")), (("WALL1", "WALL2"), ("",)),
         (("WAND-0", "WAND-1"), ("0", "1")), (("Muro +3.00", "Muro -0.20"), ("-0.20", "+3.00")),
+        (("WALL@0", "WALL@3"), ("+0.00", "+3.00")), (("0@2.8", "0@-0.1"), ("-0.10", "+2.80")), (("0", "0@0.9"), ("",)),
+        (("OG-Wand@3", "EG-Wand@6"), ("EG", "OG")),
     ],
 )  # fmt: skip
 def test_words_for_storeys_count_before_numbers_of_layers(layers: tuple[str, ...], names: tuple[str, ...]):

@@ -52,10 +52,8 @@ def kinds_and_types(document: dict[str, Any]) -> tuple[list[str], list[str | Non
 
 
 def test_blocks_of_a_dxf_become_fixtures_and_type_their_rooms() -> None:
-    content = two_rooms_dxf(
-        ("WC_Stand", "SANITAR", (0.4, 0.6), (0.2, 0.2)), ("Bett_180", "MOEBEL", (1.8, 2.0), (5.0, 0.5))
-    )
-    plan = import_plan(content)
+    toilet = ("WC_Stand", "SANITAR", (0.4, 0.6), (0.2, 0.2))
+    plan = import_plan(two_rooms_dxf(toilet, ("Bett_180", "MOEBEL", (1.8, 2.0), (5.0, 0.5))))
     assert kinds_and_types(plan.document) == (["bed", "toilet"], ["bathroom", "bedroom"])
     toilet = next(fixture for fixture in plan.document["fixtures"] if fixture["kind"] == "toilet")
     assert shapely.Polygon(toilet["outline"]).bounds == pytest.approx((0.2, 0.2, 0.6, 0.8))

@@ -9,15 +9,9 @@ import re
 import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError, SeveralLevelsError
-from lalaloc_core.importers import (
-    ImportOptions,
-    KnownDistance,
-    begins_with_plans,
-    import_if_native,
-    import_plan,
-    import_plans,
-)
+from lalaloc_core.importers import ImportOptions, KnownDistance, import_if_native, import_plan, import_plans
 from lalaloc_core.importers.common.plausibility import likely_unit
+from lalaloc_core.importers.importing import begins_with_plans
 from tests.importers.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048

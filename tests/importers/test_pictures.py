@@ -26,7 +26,6 @@ from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import find_skew
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from tests.importers.conftest import lines, names_and_types, shapes
-from tests.importers.test_fault_files import FOLDER
 from tests.painted import picture_file
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
@@ -246,6 +245,7 @@ def test_walls_that_are_paler_than_coloured_floors_are_walls():
         ("#f5f7fa", ("#99c8ff", "#ffd68a", "#ffaa96"), None),
         ("#1c1c1e", ("#3a6296", "#96783c", "#3c7d6e"), None),
         ("white", ("#19a1a1", "#7ac950", "#df5618"), "#5d6d7e"),
+        ("black", ("#19a1a1", "#7ac950", "#df5618"), "#5d6d7e"),
         ("#e7f0fa", ("#b9ddfb", "#b9ddfb", "#b9ddfb"), "#5c9dde"),
     ],
 )
@@ -262,7 +262,7 @@ def test_map_of_a_robot_has_a_room_for_each_colour_or_each_area_between_walls(
     if wall is not None:
         pen.rectangle((100, 100, 900, 800), outline=wall, width=5)
         for line in [(500, 100, 500, 250), (500, 340, 500, 500), (100, 500, 250, 500), (340, 500, 900, 500)]:
-            pen.line(line, fill=wall, width=5)
+            pen.line(line, fill=wall, width=7 if ground == "black" else 5)
     pen.rectangle((200, 600, 350, 750), fill="#ff7070")
     page = page.rotate(turn_deg, fillcolor=ground, expand=True)
     page = page.resize((round(page.width * size), round(page.height * size)))
@@ -316,12 +316,9 @@ def test_openings_that_look_like_doors_inside_are_doors_outside():
 
 def test_single_line_is_a_window_outside_and_a_passage_inside():
     page, pen = two_rooms()
-    for box, line in [
-        ((200, 95, 320, 125), ((200, 110), (320, 110))),
-        ((440, 200, 460, 290), ((450, 200), (450, 290))),
-    ]:
+    for box, ends in [((200, 95, 320, 125), (200, 110, 320, 110)), ((440, 200, 460, 290), (450, 200, 450, 290))]:
         pen.rectangle(box, fill="white")
-        pen.line(line, fill="black", width=2)
+        pen.line(ends, fill="black", width=2)
     plan = import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01))
     assert len(plan.document["rooms"]) == 2
     (window,) = lines(plan.document, "window")
@@ -409,8 +406,11 @@ def test_skew_is_found(degrees: float):
     assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
 
 
-def vector_pdf(more: str = "") -> bytes:
-    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres."""
+def vector_pdf(more: str = "", layer: str = "") -> bytes:
+    """Return a page with filled walls, a door and texts at 1:100, and more operators in centimetres.
+
+    `layer` are members of a layer /L, which the operators can be on.
+    """
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n{more}\n"
     for x, y, w, h in [
@@ -424,22 +424,31 @@ def vector_pdf(more: str = "") -> bytes:
     for line in range(8):
         content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
     objects = [
-        "<< /Type /Catalog /Pages 2 0 R >>",
+        "<< /Type /Catalog /Pages 2 0 R /OCProperties << /OCGs [6 0 R] /D << >> >> >>",
         "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
         "<< /Type /Page /Parent 2 0 R /MediaBox [0 0 400 300] /Contents 4 0 R "
-        "/Resources << /Font << /F1 5 0 R >> >> >>",
+        "/Resources << /Font << /F1 5 0 R >> /Properties << /L 6 0 R >> >> >>",
         f"<< /Length {len(content)} >>\nstream\n{content}endstream",
         "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+        f"<< /Type /OCG /Name (Old) {layer} >>",
     ]
     out, offsets = "%PDF-1.4\n", []
     for number, body in enumerate(objects, 1):
         offsets.append(len(out))
         out += f"{number} 0 obj\n{body}\nendobj\n"
     start = len(out)
-    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n" + "".join(
-        f"{offset:010} 00000 n \n" for offset in offsets
-    )
+    places = "".join(f"{offset:010} 00000 n \n" for offset in offsets)
+    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n{places}"
     return f"{out}trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
+
+
+@pytest.mark.parametrize("use", ["View", "Print"])
+def test_layer_of_a_pdf_that_is_off_by_its_use_is_left_out(use: str):
+    wall = "/OC /L BDC 2 0 0.1 5.3 re f EMC"
+    assert len(import_plan(vector_pdf(wall)).document["rooms"]) == 3
+    plan = import_plan(vector_pdf(wall, f"/Usage << /{use} << /{use}State /OFF >> >>"))
+    assert len(plan.document["rooms"]) == 2
+    assert any("switched off in the PDF were not read: 'Old'" in line for line in plan.report.notes)
 
 
 @pytest.mark.parametrize(("picture", "count"), [("", 0), ("q 3 0 0 4 10 1 cm BI /W 1 /H 1 /CS /G /BPC 8 ID x EI Q", 1)])
@@ -447,6 +456,8 @@ def test_pdf_with_lines_is_read_as_a_drawing(picture: str, count: int):
     plan = import_plan(vector_pdf(picture))
     assert sum("pictures cover 8% of the page" in warning for warning in plan.report.warnings) == count
     assert plan.report.scale_source == "1:100, written in the drawing"
+    (doubt,) = import_plan(vector_pdf(), ImportOptions(scale=50.0)).report.warnings
+    assert doubt.startswith("the median width of the leaves of 1 doors is 0.45 m")
     assert plan.report.is_draft
     assert sorted(names_and_types(plan)) == [("Kitchen", "kitchen"), ("Wohnzimmer", "living")]
     assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.35 * 5.0, 4.55 * 5.0], rel=5e-3)
@@ -473,9 +484,7 @@ def test_clear_symbols_become_fixtures_and_other_shapes_are_counted():
     fixtures = [(entry["kind"], shapely.Polygon(entry["outline"])) for entry in draft.document["fixtures"]]
     assert {kind for kind, _ in fixtures} == {"stairs", "sink", "bath", "stove", "basin", "shower"}
     for kind, outline in fixtures:
-        assert any(
-            symbol.kind == kind and intersection_over_union(symbol.outline, outline) > 0.6 for symbol in plan.symbols
-        )
+        assert any(item.kind == kind and intersection_over_union(item.outline, outline) > 0.6 for item in plan.symbols)
     assert any("fixtures are taken from their symbols" in line for line in draft.report.unsure)
     assert any("no clear symbols of fixtures" in line for line in draft.report.notes)
 
@@ -485,12 +494,6 @@ def test_walls_that_are_unreadable_without_symbols_are_read_with_them():
     plan = draw_plan("thin", 2, has_symbols=True)
     draft = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
     assert len(draft.document["rooms"]) == len(plan.rooms)
-
-
-@pytest.mark.parametrize("name", ["transparent.png", "white_on_transparent.png"])
-def test_lines_on_a_transparent_ground_are_walls_whatever_their_tone(name: str):
-    draft = import_plan((FOLDER / name).read_bytes(), ImportOptions(metres_per_pixel=0.0125))
-    assert sorted(room.area for room in shapes(draft.document)) == pytest.approx([18.91, 26.63], abs=0.4)
 
 
 def test_white_rooms_with_dark_walls_on_a_transparent_ground_are_rooms():

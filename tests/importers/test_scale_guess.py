@@ -127,12 +127,8 @@ def test_sizes_that_contradict_the_others_or_the_scale_are_named():
 def test_written_sides_of_rooms_give_the_scale_of_a_picture_with_a_title():
     page = PrintedPlan(margin_m=4.0, areas=False, dimensions=False)
     page._text((4.6, 9.0), "12 EXAMPLE STREET, SAMPLE TOWN, TWO BEDROOMS, FOR ILLUSTRATION ONLY, NOT TO SCALE")
-    for middle, text in (
-        ((2.1, 2.9), "12'10\" x 19'8\""),
-        ((6.7, 4.4), "2.90m x 4.80m"),
-        ((6.7, 1.3), "3.75m x 6.20m"),
-    ):
-        page._text(middle, text)
+    for place, text in (((2.1, 2.9), "12'10\" x 19'8\""), ((6.7, 4.4), "2.90m x 4.80m"), ((6.7, 1.3), "3.75m x 6.20m")):
+        page._text(place, text)
     report = import_plan(page.file(), limits=LIMITS).report
     assert report.metres_per_unit * page.px_per_m == pytest.approx(1.0, abs=0.02)
     assert any("23.25 m² was read as the area of a room of 13." in warning for warning in report.warnings)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,6 +15,7 @@ import pytest
 import trimesh
 
 from lalaloc_core.floorplan import FloorPlan
+from tests.importers.test_fault_files import EXPECTED, REFUSED, content_of
 from tests.service.conftest import FLAT, StartApp, assert_problem, document_of, localise, upload, wait_for
 from tests.service.test_events import follow
 from tests.strategies import rectangle
@@ -30,6 +32,17 @@ BAD_PLANS = {
     "a lone surrogate": ({**FLAT, "name": "\ud800"}, "surrogates"),
     "too wide": (_room([[0, 0], [1600, 0], [1600, 1]]), "the limit is 1000 m (max_extent_m); check that the coord"),
 }
+
+
+@pytest.mark.parametrize("name", [*EXPECTED, *REFUSED])
+def test_file_with_traits_of_real_ones_is_read_right_or_refused(client: httpx.Client, name: str) -> None:
+    expected = EXPECTED.get(name)
+    data = {} if expected is None else expected.options
+    answer = client.post("/floorplans", files={"file": (name, content_of(name))}, data=data).json()
+    if expected is None:
+        assert re.search(REFUSED[name], answer["detail"])
+    else:
+        expected.check(answer["plan"], answer["import_report"])
 
 
 @pytest.mark.parametrize(("plan", "message"), BAD_PLANS.values(), ids=BAD_PLANS.keys())

@@ -202,9 +202,7 @@ def test_several_levels_require_the_level_option(client: httpx.Client) -> None:
         ({"color": "red"}, "color", "unknown part"),
     ],
 )
-def test_invalid_option_is_rejected_by_name(
-    client: httpx.Client, options: dict[str, str], field: str, words: str
-) -> None:
+def test_invalid_option_is_named(client: httpx.Client, options: dict[str, str], field: str, words: str) -> None:
     problem = assert_problem(send_plan(client, plan_file("svg"), **options), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [field]
     assert words in problem["errors"][0]["message"]

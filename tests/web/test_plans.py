@@ -16,8 +16,10 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
 from service.security.keys import hash_of, key_text, new_secret
 from service.storage.store import Store
+from tests.importers.test_crop import SCALE, _storeys
 from tests.importers.test_lettering import AREAS_M2, PrintedPlan
 from tests.importers.test_pictures import open_hall
+from tests.painted import picture_file
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import EVERYTHING, make_key
 from tests.strategies import present
@@ -154,6 +156,20 @@ def test_printed_dimensions_give_the_scale_of_a_picture(desktop: Visit, tmp_path
     expect(page.locator("#plan-facts")).to_contain_text(re.compile(r"3 rooms, 5[012]\."), timeout=120_000)
     expect(page.locator("#picture-metres-error")).to_be_hidden()
     assert {room["name"] for room in desktop.stored("printed")["plan"]["rooms"]} == set(AREAS_M2)
+
+
+def test_all_levels_of_a_picture_replace_the_draft_of_one(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    (tmp_path / "House.png").write_bytes(picture_file(_storeys()))
+    page.locator("#plan-file").set_input_files(tmp_path / "House.png")
+    page.get_by_text("Other ways to state the scale").click()
+    page.get_by_label("Metres per pixel").fill(str(SCALE))
+    page.get_by_role("button", name="Read the picture").click()
+    expect(page.locator("#plan-name")).to_have_text("House – Storey 1", timeout=120_000)
+    page.get_by_role("button", name="Import all levels as a venue").click()
+    expect(page.locator("#venue-bar")).to_contain_text("2 plans", timeout=120_000)
+    listed = desktop.client.get("/floorplans?name=House").json()["floorplans"]
+    assert sorted(plan["name"] for plan in listed) == ["House – Storey 1", "House – Storey 2"]
 
 
 def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> None:
@@ -403,9 +419,7 @@ def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_p
 
 
 @pytest.mark.slow
-def test_link_holds_an_answer_that_the_service_does_not_keep(
-    browser: Browser, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_link_holds_an_answer_that_is_not_kept(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path) as client:
         for visited in visit(browser, client):
             page = visited.open_example()

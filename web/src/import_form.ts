@@ -188,26 +188,20 @@ export class ImportForm {
     this.all(this.file, fields);
   }
 
-  /** Filled fields of the form. */
+  /** Filled fields of the form that apply to its file. */
   private get values(): Record<string, string> {
-    return Object.fromEntries(
-      [...this.inputs]
-        .map(([name, input]): [string, string] => [name, input.value.trim()])
-        .filter(([, value]) => value !== ""),
-    );
+    const isPicture = PICTURES.test(this.file?.type ?? ""),
+      entries = [...this.inputs].map(([name, input]) => [name, input.value.trim()] as const),
+      values = Object.fromEntries(entries.filter(([name]) => !isPicture || OF_PICTURES.includes(name)));
+    if (isPicture) {
+      values.known_distance = this.picture.knownDistance ?? "";
+      values.crop = this.picture.part ?? values.crop!;
+      values.plan = this.isPlan.checked ? "true" : "";
+    }
+    return Object.fromEntries(Object.entries(values).filter(([, value]) => value !== ""));
   }
 
   private send(): void {
-    if (this.file === null) return;
-    const isPicture = PICTURES.test(this.file.type);
-    const values = Object.fromEntries(
-      Object.entries(this.values).filter(([name]) => !isPicture || OF_PICTURES.includes(name)),
-    );
-    const distance = this.picture.knownDistance,
-      part = this.picture.part;
-    if (isPicture && distance !== null) values.known_distance = distance;
-    if (isPicture && part !== null) values.crop = part;
-    if (isPicture && this.isPlan.checked) values.plan = "true";
-    this.again(this.file, values);
+    if (this.file !== null) this.again(this.file, this.values);
   }
 }

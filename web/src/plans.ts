@@ -52,6 +52,8 @@ export class Plans {
     (file, fields) => void this.upload(file, fields, true),
     () => this.closeImport(),
   );
+  /** Plans that files are stored as; all levels of a file replace one that was not edited. */
+  private readonly drafts = new WeakMap<File, Plan>();
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
   private found: PlanSummary[] = [];
   private cursor: string | null = null;
@@ -199,6 +201,9 @@ export class Plans {
     state.textContent = `Importing ${isAll ? "all levels of " : ""}“${file.name}” …`;
     try {
       const stored = await api[isAll ? "uploadLevels" : "uploadPlan"](file, fields, { onStep: showStep(file) });
+      const draft = isAll && this.drafts.get(file);
+      if (draft && (await api.plan(draft.id).catch(() => null))?.revision === draft.revision)
+        await api.deletePlan(draft.id);
       const isShown = isLast();
       if (!("plan" in stored)) {
         this.importing.close(file);
@@ -206,6 +211,7 @@ export class Plans {
       } else if (isShown) {
         this.actions.picked();
         this.take(stored);
+        this.drafts.set(file, stored);
         if (isCertain(stored)) this.importing.close();
         else this.importing.ask(file, false, stored.import_report?.levels, stored.import_report?.scale_factor);
       }

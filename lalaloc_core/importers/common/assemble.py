@@ -21,7 +21,7 @@ from lalaloc_core.floorplan.plan_document import DEFAULT_CAMERA_HEIGHT_M, DEFAUL
 from lalaloc_core.floorplan.plan_words import is_roof
 from lalaloc_core.floorplan.room_types import room_types_from_name, type_fields
 from lalaloc_core.importers.common.fixtures_in_rooms import place_fixtures, type_rooms
-from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, check_overlaps, distinct, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_options import ImportOptions
 from lalaloc_core.importers.common.import_report import ImportReport, ReportBuilder
@@ -120,7 +120,7 @@ def assemble(sketch: Sketch, builder: ReportBuilder, options: ImportOptions, lim
     if fixtures:
         document["fixtures"] = [{"kind": item.kind, "outline": _ring(item.shape.exterior)} for _, item in fixtures]
     _add_trust(document, sketch, builder)
-    builder.warnings += check_document(document, is_scale_certain=is_certain, metres_per_unit=metres_per_unit)
+    builder.warnings += check_document(document, is_certain=is_certain, metres_per_unit=metres_per_unit)
     # Validate now, while the error can still refer to the file.
     plan = FloorPlan.from_dict(document, limits)
     builder.warnings += [f"{line}; draw each area once" for line in plan.warnings if " overlap" in line]
@@ -156,9 +156,7 @@ def assemble_levels(
     """
     chosen = choose_levels(levels, options)
     if len(chosen) > (most := budget.limits.max_levels):
-        raise InvalidFloorPlanError(
-            f"the file has {len(chosen)} levels; the limit is {most} (max_levels); choose one with level"
-        )
+        raise InvalidFloorPlanError(f"the file has {len(chosen)} levels; the limit is {most} (max_levels); set level")
     plans: list[ImportedPlan] = []
     empty: dict[str, NoRoomError] = {}
     for done, (level, content) in enumerate(chosen):
@@ -179,10 +177,8 @@ def assemble_levels(
         roofs = [plan.level.name for plan in plans if plan.level is not None and plan not in below]
         reasons += [(name, "it is a roof (set level to read it)") for name in roofs[:_MAX_NAMED]]
         plans = below
-    left_out = [f"level '{name}' was left out: {reason}" for name, reason in reasons]
-    return tuple(
-        replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *left_out))) for plan in plans
-    )
+    lost = [f"level '{name}' was left out: {reason}" for name, reason in reasons]
+    return tuple(replace(plan, report=replace(plan.report, warnings=(*plan.report.warnings, *lost))) for plan in plans)
 
 
 def clean_name(name: str | None) -> str | None:
@@ -193,19 +189,13 @@ def clean_name(name: str | None) -> str | None:
     return " ".join(spaced.split())[: DEFAULT_LIMITS.max_name_length] or None
 
 
-def _clean(
-    room: SketchedRoom, obstacles: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder
-) -> list[SketchedRoom]:
+def _clean(room: SketchedRoom, tree: shapely.STRtree, limits: PlanLimits, builder: ReportBuilder) -> list[SketchedRoom]:
     label = _label(room)
     shape = room.shape
-    near = obstacles.geometries[np.sort(obstacles.query(shape))]
+    near = tree.geometries[np.sort(tree.query(shape))]
     if inside := [obstacle for obstacle in near if obstacle.intersects(shape)]:
         shape = shapely.difference(shape, shapely.union_all(inside))
-    floors = [
-        simple
-        for floor in polygons_from_geometry(shape)
-        for simple in _simple(_simplify(floor, label, limits, builder))
-    ]
+    floors = [simple for floor in polygons_of(shape) for simple in _simple(_simplify(floor, label, limits, builder))]
     floors = [floor for floor in floors if floor.area >= limits.min_room_area_m2]
     if not floors and room.shape.area >= _SLIVER_M2:
         builder.notes.append(
@@ -294,12 +284,12 @@ def _vertices(shape: BaseGeometry) -> int:
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     """Return polygons with rounded coordinates whose outlines do not touch themselves."""
     found = []
-    for part in polygons_from_geometry(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
+    for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
         if shapely.Polygon(part.exterior).is_valid:
             found.append(part)
         else:
             apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
-            found += polygons_from_geometry(shapely.set_precision(apart, _GRID_M))
+            found += polygons_of(shapely.set_precision(apart, _GRID_M))
     return found
 
 

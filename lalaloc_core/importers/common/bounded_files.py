@@ -66,9 +66,7 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tuple[str, ...]) -> dict[str, bytes]:
-    members = [
-        member for member in archive.infolist() if not member.is_dir() and member.filename.casefold().endswith(suffixes)
-    ]
+    members = [item for item in archive.infolist() if not item.is_dir() and item.filename.casefold().endswith(suffixes)]
     if len(members) > limits.max_archive_files:
         raise InvalidFloorPlanError(
             f"the archive has {len(members)} files ({', '.join(suffixes)}); the limit is {limits.max_archive_files} "
@@ -129,7 +127,7 @@ def read_xml(content: bytes, budget: Budget) -> Element:
         ) from error
     except defusedxml.DefusedXmlException as error:
         raise InvalidFloorPlanError(
-            "the XML refers to other files, which are not read; save a drawing as plain SVG"
+            "the XML refers to other files, which are not read; save it as plain SVG"
         ) from error
     except ParseError as error:
         line, column = error.position

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.import_report import ReportBuilder
 
 # Largest coordinate of a file, in any unit: 10,000 km in millimetres.
@@ -125,8 +126,7 @@ def _side(
     start: Float[np.ndarray, "k 2"], end: Float[np.ndarray, "k 2"], point: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k"]:
     """Return the sign of the side of a line that a point lies on."""
-    along, away = end - start, point - start
-    return np.sign(along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0])
+    return np.sign(cross(end - start, point - start))
 
 
 def check_coordinates(points: Float[np.ndarray, "..."], where: str) -> None:
@@ -144,7 +144,7 @@ def in_range(points: Float[np.ndarray, "..."]) -> bool:
     return bool((np.abs(points) <= MAX_COORDINATE).all())
 
 
-def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
+def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
     """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
         return []
@@ -163,7 +163,7 @@ def polygons_from_geometry(geometry: BaseGeometry) -> list[shapely.Polygon]:
     if isinstance(valid, shapely.Polygon):
         return [valid] if valid.area > 0.0 else []
     has_parts = isinstance(valid, shapely.MultiPolygon | shapely.GeometryCollection)
-    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_from_geometry(part)]
+    return [polygon for part in shapely.get_parts(valid) if has_parts for polygon in polygons_of(part)]
 
 
 def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = False) -> list[shapely.Polygon]:
@@ -180,7 +180,7 @@ def even_odd_polygons(rings: Iterable[shapely.Polygon], *, is_nonzero: bool = Fa
     while len(shapes) > 1:
         pairs = zip(shapes[::2], shapes[1::2], strict=False)
         shapes = [*(shapely.symmetric_difference(a, b) for a, b in pairs), *shapes[len(shapes) & ~1 :]]
-    return polygons_from_geometry(shapes[0]) if shapes else []
+    return polygons_of(shapes[0]) if shapes else []
 
 
 def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -217,14 +217,27 @@ def extent_of(shapes: Sequence[BaseGeometry]) -> float:
     return float(max(x1 - x0, y1 - y0))
 
 
+def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
+    """Group shapes that are near each other into one geometry each."""
+    if not shapes:
+        return []
+    check_network(shapes)
+    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
+    tree = shapely.STRtree(shapely.get_parts(around))
+    members: dict[int, list[BaseGeometry]] = {}
+    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
+        members.setdefault(region, []).append(shapes[index])
+    return [shapely.GeometryCollection(group) for group in members.values()]
+
+
 def label_position(room: shapely.Polygon) -> tuple[float, float]:
     """Return the centre of the largest circle in a room."""
     return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])
 
 
-def cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
-    """Return the third component of the cross product; it is positive where b points to the left of a."""
-    return float(a[0] * b[1] - a[1] * b[0])
+def cross(a: Float[np.ndarray, "*n 2"], b: Float[np.ndarray, "*m 2"]) -> Float[np.ndarray, "*n"]:
+    """Return the third component of cross products; it is positive where b points to the left of a."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, float]:
@@ -300,7 +313,7 @@ class Floor:
     higher_m2: float
 
 
-def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: Callable[[], None]) -> Floor | None:
+def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: CheckTime) -> Floor | None:
     """Return the floor among the faces of a solid, or of a surface, in metres; None if all faces are steep.
 
     The floor begins with the lowest face and grows over faces that touch it, up to a step of 60 cm each. `check_time`
@@ -340,9 +353,7 @@ def find_floor(faces: Iterable[Float[np.ndarray, "_ 3"]], check_time: Callable[[
 def report_floor(name: str, floor: Floor, builder: ReportBuilder) -> None:
     """Report a floor that is not level, and parts of a room that are higher than its floor."""
     if floor.rise_m > _UNEVEN_M:
-        builder.notes.append(
-            f"the floor of {name} rises by {floor.rise_m:.2f} m; heights in it count from its lowest point"
-        )
+        builder.notes.append(f"the floor of {name} rises by {floor.rise_m:.2f} m; heights count from its lowest point")
     whole_m2 = floor.higher_m2 + sum(part.area for part in floor.parts)
     if floor.higher_m2 > _MIN_HIGHER * whole_m2:
         builder.warnings.append(
@@ -354,7 +365,7 @@ def report_floor(name: str, floor: Floor, builder: ReportBuilder) -> None:
 def join_faces(shapes: list[shapely.Polygon]) -> list[shapely.Polygon]:
     """Return the area that faces cover, without the gaps that rounding leaves between them."""
     union = shapely.unary_union([shape.buffer(_SEAM_M, join_style="mitre") for shape in shapes])
-    return polygons_from_geometry(union.buffer(-_SEAM_M, join_style="mitre"))
+    return polygons_of(union.buffer(-_SEAM_M, join_style="mitre"))
 
 
 def _seen_from_above(face: Float[np.ndarray, "n 3"]) -> shapely.Polygon | None:
@@ -367,5 +378,5 @@ def _seen_from_above(face: Float[np.ndarray, "n 3"]) -> shapely.Polygon | None:
     size = float(np.linalg.norm(normal))
     if size < 1e-9 or abs(normal[2]) < _FLAT * size:
         return None
-    parts = polygons_from_geometry(shapely.Polygon(face[:, :2]))
+    parts = polygons_of(shapely.Polygon(face[:, :2]))
     return max(parts, key=lambda part: part.area, default=None)

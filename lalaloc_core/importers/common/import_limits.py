@@ -72,8 +72,8 @@ class ImportStep:
         return self.step if self.total is None else f"{self.step} ({(self.done or 0) + 1} of {self.total})"
 
 
-# Called with every step as it begins.
-OnStep = Callable[[ImportStep], None]
+# Called with every step as it begins, and between steps, which raises an exception to stop.
+OnStep, CheckTime = Callable[[ImportStep], None], Callable[[], None]
 
 
 @dataclass

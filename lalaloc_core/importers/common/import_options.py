@@ -169,13 +169,16 @@ def _ordered_crop(crop: tuple[float, float, float, float]) -> tuple[float, float
     return min(x0, x1), min(y0, y1), max(x0, x1), max(y0, y1)
 
 
-def _number(name: str, text: str) -> float:
+def to_number(text: object) -> float:
+    """Return the number in a text, NaN if there is none; float() accepts 1_000, which other tools do not."""
     try:
-        # float() accepts 1_000, which other tools do not.
-        value = math.nan if "_" in text else float(text)
+        return math.nan if "_" in str(text) else float(str(text))
     except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
+        return math.nan
+
+
+def _number(name: str, text: str) -> float:
+    if not math.isfinite(value := to_number(text)):
         raise InvalidFloorPlanError(f"{name} is '{text[:50]}'; it must be a number")
     return value
 

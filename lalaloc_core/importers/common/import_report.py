@@ -98,7 +98,10 @@ class ImportReport:
 
 @dataclass
 class ReportBuilder:
-    """Fields of an `ImportReport` while a file is read; `no_room` are areas in metres, the largest first."""
+    """Fields of an `ImportReport` while a file is read; `no_room` are areas in metres, the largest first.
+
+    `places` are those (m) of lines that are about one place, and so about one storey of several.
+    """
 
     format: str = ""
     metres_per_unit: float = 1.0
@@ -116,6 +119,7 @@ class ReportBuilder:
     scale_factor: float | None = None
     rejected_texts: list[str] = field(default_factory=list)
     levels: tuple[str, ...] = ()
+    places: dict[str, BaseGeometry] = field(default_factory=dict)
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
         """Count entities of a layer by their use; "ignored" is a use too."""
@@ -132,7 +136,7 @@ class ReportBuilder:
     def build(self) -> ImportReport:
         """Return the finished report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
-        facts: dict[str, Any] = {name: value for name, value in vars(self).items() if name != "uses"}
+        facts: dict[str, Any] = {name: value for name, value in vars(self).items() if name not in ("uses", "places")}
         facts |= {name: _limit_lines(facts[name]) for name in ("notes", "warnings", "unsure", "rejected_texts")}
         outlines = [area.exterior.simplify(_COARSE_M).coords[:-1] for area in self.no_room[:_MAX_AREAS]]
         facts["no_room"] = tuple(tuple((round(x, 2), round(y, 2)) for x, y in outline) for outline in outlines)

@@ -61,9 +61,7 @@ def projection(shapes: Sequence[BaseGeometry], crs: str | None, options: ImportO
         try:
             low, high = (convert(np.array([corner]))[0] for corner in (low, high))
         except ProjError as error:
-            raise InvalidFloorPlanError(
-                f"the crs '{crs}' is unknown or cannot be used; export the file in WGS84"
-            ) from error
+            raise InvalidFloorPlanError(f"the crs '{crs}' is unknown or cannot be used; export it in WGS84") from error
     exchanged, why = (False, "") if crs is not None else _order(shapes, low, high)
     if exchanged:
         found = projection([_flipped(shape) for shape in shapes], ORDERED, options)

@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.common.geometry import lines_of, point_xy, polygons_from_geometry, segments_of
+from lalaloc_core.importers.common.geometry import lines_of, point_xy, polygons_of, segments_of
 from lalaloc_core.importers.common.sketch import Point, SketchedOpening
 
 # Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
@@ -59,7 +59,7 @@ class WallLines:
     """
 
     def __init__(self, rooms: Sequence[shapely.Polygon]) -> None:
-        walls = [part for room in rooms for part in polygons_from_geometry(room.simplify(_ON_WALL_M))]
+        walls = [part for room in rooms for part in polygons_of(room.simplify(_ON_WALL_M))]
         self._tree = shapely.STRtree(lines_of(_edges(walls)))
 
     def line_at(self, point: shapely.Point, width_m: float) -> tuple[Point, Point] | None:

@@ -26,24 +26,22 @@ _MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
 UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
 
 
-def check_document(
-    document: Mapping[str, Any], *, is_scale_certain: bool = False, metres_per_unit: float = 1.0
-) -> list[str]:
+def check_document(document: Mapping[str, Any], *, is_certain: bool = False, metres_per_unit: float = 1.0) -> list[str]:
     """Return warnings about a plan as `FloorPlan.from_dict` expects it, except overlaps, of which `FloorPlan` warns.
 
     Values of the document may be out of range; those of the file were multiplied by `metres_per_unit`. With
-    `is_scale_certain`, rooms and doors of unusual size give no warning.
+    `is_certain`, rooms and doors of unusual size give no warning.
     """
     rooms = [shapely.Polygon(room["polygon"]) for room in document["rooms"]]
     names = [room.get("name", f"room {index + 1}") for index, room in enumerate(document["rooms"])]
     warnings = _ceiling_warnings(document, names)
-    if not is_scale_certain:
+    if not is_certain:
         warnings += _size_warnings(document, rooms, metres_per_unit)
     duplicates = [name for name, count in Counter(names).items() if count > 1]
     if duplicates:
         warnings.append(f"rooms share a name: {_list_names(duplicates)}; answers distinguish them by id only")
     if len(rooms) <= _MAX_ROOMS_COMPARED:
-        warnings += _isolated_rooms(rooms, names) + _unreachable_rooms(document, rooms, names)
+        warnings += _isolated_rooms(rooms, names) + _unreached_rooms(document, rooms, names)
     return warnings
 
 
@@ -72,12 +70,12 @@ def unit_hints(subject: str, value: float, usual_m: tuple[float, float], metres_
     return [f"{subject} is {value:g} m; the usual range is {low:.2g} to {high:.2g} m; {advice}"]
 
 
-def check_leaves(leaves_m: Sequence[float], metres_per_unit: float) -> list[str]:
-    """Return a warning if the leaves of doors in a drawing are alike, but not as wide as usual."""
+def check_leaves(leaves_m: Sequence[float], metres_per_unit: float, least: int = 2) -> list[str]:
+    """Return a warning if at least so many leaves of doors in a drawing are alike, but not as wide as usual."""
     median = float(np.median(leaves_m or [0.0]))
     alike = sum(abs(leaf / median - 1.0) <= _ALIKE for leaf in leaves_m)
     usual = sum(_WIDTHS_M[0] <= leaf <= _WIDTHS_M[1] for leaf in leaves_m)
-    if alike < max(2, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
+    if alike < max(least, 0.5 * len(leaves_m)) or usual > _SOME * len(leaves_m):
         return []
     subject = f"the median width of the leaves of {len(leaves_m)} doors"
     found = unit_hints(subject, round(median, 4), _WIDTHS_M, metres_per_unit)
@@ -119,9 +117,7 @@ def _isolated_rooms(rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> l
     return [warning] if len(rooms) > 1 and isolated else []
 
 
-def _unreachable_rooms(
-    document: Mapping[str, Any], rooms: Sequence[shapely.Polygon], names: Sequence[str]
-) -> list[str]:
+def _unreached_rooms(document: Mapping[str, Any], rooms: Sequence[shapely.Polygon], names: Sequence[str]) -> list[str]:
     """Find rooms without a door or passage, in a plan that has any."""
     entries = opening_lines(document, "door") + opening_lines(document, "passage")
     reached = set(reached_rooms(rooms, entries))

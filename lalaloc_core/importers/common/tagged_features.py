@@ -20,9 +20,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, room_types_from_name
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import opening_line, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, to_number
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.map_projection import ORDERED, projection
 from lalaloc_core.importers.common.opening_placement import WallLines
@@ -164,10 +164,7 @@ def _level_names(text: str) -> list[str]:
 
 
 def _level(key: str) -> Level:
-    try:
-        number = float(key)
-    except ValueError:
-        number = math.nan
+    number = to_number(key)
     return Level(key, number if math.isfinite(number) else None)
 
 
@@ -234,12 +231,12 @@ class _Drawer:
             builder.use(layer, "ignored (not in the option layers)")
         elif role == "room":
             self._add_rooms(feature, shape, layer)
-        elif role in ("obstacle", "ignored") and (kind := _fixture(properties)) and polygons_from_geometry(shape):
-            parts = polygons_from_geometry(shape)
+        elif role in ("obstacle", "ignored") and (kind := _fixture(properties)) and polygons_of(shape):
+            parts = polygons_of(shape)
             builder.use(layer, "fixtures", len(parts))
             sketch.fixtures += [SketchedFixture(kind, part) for part in parts]
         elif role == "obstacle":
-            parts = polygons_from_geometry(shape)
+            parts = polygons_of(shape)
             builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
             sketch.obstacles += parts
         elif role == "door" or role == "window" or role == "passage":
@@ -258,7 +255,7 @@ class _Drawer:
         if area.is_empty and isinstance(shape, shapely.LineString) and len(shape.coords) > _CORNERS:
             area = shapely.Polygon(shape.coords)
             self._builder.notes.append(f"the open outline of '{_name(feature.properties)}' was closed")
-        properties, parts = feature.properties, polygons_from_geometry(area)
+        properties, parts = feature.properties, polygons_of(area)
         self._builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         name = _name(properties)
         types = _room_types(properties, name)

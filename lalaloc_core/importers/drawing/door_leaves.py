@@ -48,7 +48,7 @@ def take_leaves(
     return kept, leaves
 
 
-def with_half_open_doors(drawing: Drawing) -> Drawing:
+def with_swings(drawing: Drawing) -> Drawing:
     """Return a drawing in metres whose lines on layers of doors that are arcs of leaves are swings."""
     arcs = [_arc(stroke) if stroke.role == "door" else None for stroke in drawing.strokes]
     return replace(

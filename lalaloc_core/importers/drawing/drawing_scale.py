@@ -15,6 +15,7 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.geometry import extent_of, lines_of, segments_of, side_lengths
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.import_report import ReportBuilder
 from lalaloc_core.importers.common.sketch import SketchedRoom
@@ -91,21 +92,21 @@ _EXTENT_M = (3.0, 300.0)
 # Length of a unit of any drawing (m).
 _METRES_PER_UNIT = (1e-9, 1e4)
 
-# Text of a dimension, and the lengths in units of the drawing that it may be about.
-Dimension = tuple[str, Sequence[float]]
+# Text of a dimension, and the lengths in units of the drawing that it may be about; metres per unit and their source.
+Dimension, Scale = tuple[str, Sequence[float]], tuple[float, str]
 
 
 def drawing_scale(
     options: ImportOptions,
     subject: str,
     drawings: Sequence[Drawing] = (),
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     *,
     paper_m_per_unit: float | None = None,
     paper_m: float | None = None,
-    own: tuple[float, str] | None = None,
-    guess: Callable[[Sequence[tuple[float, str]]], tuple[float, str] | None] = lambda written: None,
-) -> tuple[float, str]:
+    own: Scale | None = None,
+    guess: Callable[[Sequence[Scale]], Scale | None] = lambda written: None,
+) -> Scale:
     """Return metres per unit of a drawing, and the source of that value.
 
     The options take precedence, then the file's `own` value with its source, then "1:100" in a text of the drawings if
@@ -115,7 +116,7 @@ def drawing_scale(
     multiplies any of them.
     """
 
-    def checked(metres_per_unit: float, source: str) -> tuple[float, str]:
+    def checked(metres_per_unit: float, source: str) -> Scale:
         low, high = _METRES_PER_UNIT
         if not low <= metres_per_unit <= high:
             raise InvalidFloorPlanError(
@@ -124,7 +125,7 @@ def drawing_scale(
             )
         return metres_per_unit, source
 
-    def given() -> tuple[float, str]:
+    def given() -> Scale:
         if options.known_distance is not None:
             return options.known_distance.metres_per_unit, "option known_distance"
         if options.metres_per_pixel is not None:
@@ -165,7 +166,7 @@ def drawing_scale(
     return checked(factor * options.multiply, f"{source}, times {options.multiply:g} (option multiply)")
 
 
-def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, str]]:
+def _written_scales(texts: Sequence[str], paper_m: float) -> list[Scale]:
     """Return the denominators of the scales written, for a page with the longer side `paper_m`, and their sources."""
 
     def ratio(inches: re.Match[str]) -> str:
@@ -194,7 +195,7 @@ def _written_scales(texts: Sequence[str], paper_m: float) -> list[tuple[float, s
     return found
 
 
-def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple[float, str] | None:
+def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> Scale | None:
     """Return metres per unit that most dimensions agree on, and their number in words; None if too few agree.
 
     `extent` is the size of the drawing in its units.
@@ -216,9 +217,7 @@ def scale_by_dimensions(dimensions: Sequence[Dimension], extent: float) -> tuple
     return math.exp(middle), f"{count} dimensions written in the drawing"
 
 
-def check_scale(
-    metres_per_unit: float, source: str, measured: tuple[float, str] | None, builder: ReportBuilder
-) -> None:
+def check_scale(metres_per_unit: float, source: str, measured: Scale | None, builder: ReportBuilder) -> None:
     """Warn if a scale differs from that of the sizes that are written in the drawing, `measured`."""
     if measured is not None and abs(metres_per_unit / measured[0] - 1.0) > _TOLERANCE:
         builder.scale_factor = measured[0] / metres_per_unit
@@ -254,34 +253,41 @@ def check_areas(
     is_sure, length = len(agreeing) >= _MIN_AREAS, math.sqrt(middle)
     # Without sizes that agree, the scale is believed.
     usual, tolerance = (middle, _AREA_TOLERANCE) if is_sure else (1.0, 0.1)
-    against = [
+    against = {
         f"{areas[index][0]:.4g} m² was read as the area of a room of {areas[index][1]:.1f} m²"
-        + (f" ('{rooms[index].name}')" if rooms[index].name else "")
+        + (f" ('{rooms[index].name}')" if rooms[index].name else ""): rooms[index].shape
         for index, share in shares.items()
         if abs(share / usual - 1.0) > tolerance
-    ]
+    }
     for index, written in enumerate([*texts, outside]):
         # Open rooms have the sizes of their parts; a single size that does not fit is a contradiction.
         unused = [f"'{text[:50]}'" for text in written if index not in areas and _has_size(text)]
         reason = "does not fit its room" if len(unused) == 1 else "is one of several in a room"
         reason = reason if index < len(rooms) else "is in no room"
         lines = [f"{text} was read as the size of a room, but {reason}" for text in unused]
-        (against if len(lines) == 1 and index < len(rooms) else builder.rejected_texts).extend(lines)
+        placed = dict.fromkeys(lines, rooms[index].shape) if index < len(rooms) else {}
+        builder.places |= placed
+        if len(placed) == 1:
+            against |= placed
+        else:
+            builder.rejected_texts += lines
     if not is_sure:
         builder.rejected_texts += against
+        builder.places |= against
         return
-    builder.warnings += [f"{text}, against {len(agreeing)} sizes that agree; check its walls" for text in against]
+    agreed = f"against {len(agreeing)} sizes that agree; check its walls"
+    against = {f"{text}, {agreed}": place for text, place in against.items()}
+    builder.warnings += against
+    builder.places |= against
     if abs(length - 1.0) <= _TOLERANCE:
         builder.notes.append(f"the areas written in {len(shares)} rooms agree with the scale")
     measured = builder.metres_per_unit / length, f"the areas and sides written in {len(agreeing)} rooms"
     check_scale(builder.metres_per_unit, builder.scale_source, measured, builder)
 
 
-def areas_of_rooms(
-    shapes: Sequence[shapely.Polygon], letterings: Sequence[Lettering]
-) -> dict[int, tuple[float, float]]:
+def areas_of_rooms(shapes: Sequence[shapely.Polygon], written: Sequence[Lettering]) -> dict[int, tuple[float, float]]:
     """Return the area (m²) that is written in each room, and the room's area, by the index of the room."""
-    texts, _ = texts_of_rooms(shapes, letterings)
+    texts, _ = texts_of_rooms(shapes, written)
     return _written_areas(shapes, [[lettering.text for lettering in found] for found in texts])
 
 
@@ -354,7 +360,7 @@ def _areas_m2(text: str) -> tuple[float, ...]:
     return tuple(area for area in areas if _AREA_M2[0] <= area <= _AREA_M2[1])
 
 
-def written_dimensions(drawing: Drawing, check_time: Callable[[], None]) -> list[Dimension]:
+def written_dimensions(drawing: Drawing, check_time: CheckTime) -> list[Dimension]:
     """Return the texts of a drawing that can be dimensions, with the lengths of the lines that they are written at."""
     texts = [lettering for lettering in drawing.letterings if values_m(lettering.text)][:_MAX_TEXTS]
     segments = segments_of([stroke.line for stroke in drawing.strokes])

@@ -7,7 +7,7 @@ light area hides a part of a wall.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -15,13 +15,8 @@ from jaxtyping import Bool, Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import (
-    check_network,
-    opening_line,
-    point_xy,
-    polygons_from_geometry,
-    side_lengths,
-)
+from lalaloc_core.importers.common.geometry import check_network, opening_line, point_xy, polygons_of, side_lengths
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.drawing.vector_drawing import Patch
 
@@ -46,9 +41,7 @@ _TOUCHING_M = 0.01
 _PAIRS, _PAIRS_PER_AREA = 1000, 4
 
 
-def drawn_panes(
-    lines: Iterable[shapely.LineString], walls: BaseGeometry, least: int, check_time: Callable[[], None]
-) -> list[Gap]:
+def drawn_panes(lines: list[shapely.LineString], walls: BaseGeometry, least: int, check_time: CheckTime) -> list[Gap]:
     """Return the windows among the thin lines of a drawing (m).
 
     The walls include the areas between the lines of windows, if walls are drawn with two lines. At least `least` lines
@@ -125,10 +118,7 @@ def _is_in_wall(area: shapely.Polygon, walls: BaseGeometry) -> bool:
 
 
 def cut_painted(
-    bodies: Sequence[tuple[shapely.Polygon, int]],
-    patches: Sequence[Patch],
-    thickest_m: float,
-    check_time: Callable[[], None],
+    bodies: Sequence[tuple[shapely.Polygon, int]], patches: Sequence[Patch], thickest_m: float, check_time: CheckTime
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Take what is hidden from walls, which come with their places in the order of painting, in metres.
 
@@ -152,12 +142,12 @@ def cut_painted(
         for k, part in covered:
             hidden.setdefault(k, []).append(part)
         rest = shapely.difference(body, shapely.union_all([part for _, part in covered]))
-        visible += polygons_from_geometry(rest) if covered else [body]
+        visible += polygons_of(rest) if covered else [body]
     walls = shapely.STRtree(visible)
     gaps: list[Gap] = []
     for k, parts in hidden.items():
         check_time()
-        pieces = polygons_from_geometry(shapely.union_all(parts))
+        pieces = polygons_of(shapely.union_all(parts))
         gaps += filter(None, [_gap(piece, walls, patches[k], thickest_m) for piece in pieces])
     return visible, gaps
 

@@ -16,7 +16,8 @@ import shapely
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.common.geometry import WallAreas, check_network, distinct, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import WallAreas, check_network, cross, distinct, point_xy, polygons_of
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, WallConfig
 
 # Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
@@ -81,7 +82,7 @@ def enclose(
     lines: Sequence[shapely.LineString],
     closers: Sequence[BaseGeometry] = (),
     config: WallConfig = ROOM_BOUNDS.walls,
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> Enclosed:
     """Find the rooms between walls.
@@ -126,13 +127,11 @@ def explained_size(rooms: Sequence[shapely.Polygon]) -> float:
 def find_gaps(
     walls: BaseGeometry,
     config: WallConfig,
-    check_time: Callable[[], None] = lambda: None,
+    check_time: CheckTime = lambda: None,
     rank: Callable[[Gap], int | None] = _rank_by_walls,
 ) -> list[Gap]:
     """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
-    areas = WallAreas(
-        [simple for part in polygons_from_geometry(walls) for simple in polygons_from_geometry(part.simplify(0.004))]
-    )
+    areas = WallAreas([simple for part in polygons_of(walls) for simple in polygons_of(part.simplify(0.004))])
     rings = shapely.get_rings(shapely.orient_polygons(areas.parts))
     ends = [end for ring in rings for end in _ends(shapely.get_coordinates(ring), config)]
     check_time()
@@ -156,16 +155,14 @@ def find_gaps(
     return [gaps[index] for index in without_overlaps([gap.shape for gap in gaps], 0.25, check_time)]
 
 
-def without_overlaps(
-    shapes: Sequence[shapely.Polygon], share: float, check_time: Callable[[], None] = lambda: None
-) -> list[int]:
-    """Return the numbers of the shapes that share less than a part of their area with each that was kept before."""
-    tree, is_kept = shapely.STRtree(shapes), np.zeros(len(shapes), bool)
-    for index, shape in enumerate(shapes):
+def without_overlaps(areas: Sequence[shapely.Polygon], share: float, check_time: CheckTime = lambda: None) -> list[int]:
+    """Return the numbers of the areas that share less than a part of their area with each that was kept before."""
+    tree, is_kept = shapely.STRtree(areas), np.zeros(len(areas), bool)
+    for index, shape in enumerate(areas):
         check_time()
         near = tree.query(shape)
-        shared = (shapely.intersection(shape, shapes[k]).area for k in near[is_kept[near]])
-        is_kept[index] = all(area < share * shape.area for area in shared)
+        shared = (shapely.intersection(shape, areas[k]).area for k in near[is_kept[near]])
+        is_kept[index] = all(shared_area < share * shape.area for shared_area in shared)
     return np.flatnonzero(is_kept).tolist()
 
 
@@ -200,7 +197,7 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
     steps = np.roll(points, -1, axis=0) - points
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / np.maximum(lengths, 1e-12)[:, None]
-    turns = _cross(directions, np.roll(directions, -1, axis=0))
+    turns = cross(directions, np.roll(directions, -1, axis=0))
     is_end = (lengths >= config.thinnest) & (lengths <= max(config.thickest, config.widest_pier))
     found = []
     for i in np.flatnonzero(is_end & (np.minimum(np.roll(turns, 1), turns) >= _CORNER)).tolist():
@@ -247,7 +244,7 @@ def _gaps_before(walls: Sequence[_End], areas: WallAreas, config: WallConfig) ->
 
 
 def _faces(
-    lines: Sequence[shapely.LineString], config: WallConfig, check_time: Callable[[], None]
+    lines: Sequence[shapely.LineString], config: WallConfig, check_time: CheckTime
 ) -> tuple[list[shapely.Polygon], list[shapely.LineString]]:
     """Return the areas between the joined lines, and the lines that bound no area."""
     segments = _network(lines)
@@ -283,7 +280,7 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
         steps = ends[beside] - ends[index]
         apart = np.linalg.norm(steps, axis=1)
         across = np.abs(steps @ directions[index]) < 0.25 * np.maximum(apart, 1e-12)
-        parallel = np.abs(_cross(directions[beside], directions[index][None])) < 0.1
+        parallel = np.abs(cross(directions[beside], directions[index][None])) < 0.1
         partners = np.flatnonzero((apart > config.thinnest) & (apart <= config.thickest) & across & parallel)
         if len(partners):
             partner = beside[partners[np.argmin(apart[partners])]]
@@ -308,10 +305,7 @@ def _loose_ends(segments: Sequence[shapely.LineString]) -> tuple[Float[np.ndarra
 
 
 def _from_single_lines(
-    lines: Sequence[shapely.LineString],
-    closers: Sequence[BaseGeometry],
-    config: WallConfig,
-    check_time: Callable[[], None],
+    lines: Sequence[shapely.LineString], closers: Sequence[BaseGeometry], config: WallConfig, check_time: CheckTime
 ) -> Enclosed:
     """Find rooms between walls without thickness; gaps lie in front of loose ends."""
     if not lines:
@@ -344,14 +338,12 @@ def _from_single_lines(
     return Enclosed(_insides([walls, *joints, *closers], config, check_time), list(distinct.values()), walls)
 
 
-def _insides(
-    pieces: Sequence[BaseGeometry], config: WallConfig, check_time: Callable[[], None]
-) -> list[shapely.Polygon]:
+def _insides(pieces: Sequence[BaseGeometry], config: WallConfig, check_time: CheckTime) -> list[shapely.Polygon]:
     """Return the areas enclosed by the union of some pieces that are large enough for a room, the largest first."""
-    parts = polygons_from_geometry(shapely.unary_union(list(pieces)))
+    parts = polygons_of(shapely.unary_union(list(pieces)))
     filled = shapely.union_all([shapely.Polygon(part.exterior) for part in parts])
     rooms = []
-    for floor in polygons_from_geometry(shapely.difference(filled, shapely.MultiPolygon(parts))):
+    for floor in polygons_of(shapely.difference(filled, shapely.MultiPolygon(parts))):
         check_time()
         if floor.area >= config.smallest_room_m2 and not _is_thin(floor, config.shallowest_room):
             rooms.append(floor.simplify(0.004))
@@ -369,7 +361,3 @@ def _is_wall(face: shapely.Polygon, config: WallConfig) -> bool:
     usual = 2.0 * face.area / face.length
     is_slim = face.length >= _LONG_M and usual <= _USUAL * config.thickest
     return is_slim and face.buffer(-0.5 * _WIDEST * config.thickest).is_empty
-
-
-def _cross(a: Float[np.ndarray, "n 2"], b: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "n"]:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

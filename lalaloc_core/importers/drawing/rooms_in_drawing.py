@@ -18,11 +18,11 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import check_overlaps, polygons_from_geometry, side_lengths
+from lalaloc_core.importers.common.geometry import check_overlaps, clusters, polygons_of, side_lengths
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS, RoomBounds
 from lalaloc_core.importers.drawing.drawn_openings import cut_painted, drawn_panes
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose, explained_size
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, clusters, split_lines
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Stroke, Swing, line_of, split_lines
 
 _MAX_NAMED = 8
 _NAMED = "the walls"
@@ -88,9 +88,8 @@ def choose_reading(
                 continue
             if found is not None:
                 rooms = [Area(shape, "", "room") for shape in found.rooms]
-                readings.append(
-                    Reading(f"the areas enclosed by {source}", rooms, found.gaps, found.walls, bounds=bounds)
-                )
+                named = f"the areas enclosed by {source}"
+                readings.append(Reading(named, rooms, found.gaps, found.walls, bounds=bounds))
         if refused is not None and not any(reading.rooms for reading in readings):
             raise refused
     nothing = Reading("the areas enclosed by all lines", [], walls=shapely.Polygon(), bounds=bounds)
@@ -231,16 +230,15 @@ def _by_dark_areas(drawing: Drawing, budget: Budget) -> Enclosed | None:
 
 def _drawn_thick(drawing: Drawing, role: Role | None, bounds: RoomBounds) -> list[tuple[shapely.Polygon, int]]:
     """Return what lines of a thick pen cover, of one role, with their places in the order of painting."""
-    drawn = [item for item in (*drawing.strokes, *drawing.areas) if item.role == role and _is_thick(item, bounds)]
-    return [(part, item.order) for item in drawn for part in polygons_from_geometry(_covered(item, bounds))]
+    drawn = [item for item in drawing.lines if item.role == role and _is_thick(item, bounds)]
+    return [(part, item.order) for item in drawn for part in polygons_of(_covered(item, bounds))]
 
 
 def _covered(item: Stroke | Area, bounds: RoomBounds) -> BaseGeometry:
     """Return what a line of a thick pen covers; the outline of a wall or pillar is its faces, whatever the pen."""
     if isinstance(item, Area) and not _is_outline(item, bounds):
         return item.shape
-    line = item.line if isinstance(item, Stroke) else item.shape.boundary
-    return line.buffer(0.5 * item.width, cap_style="square", join_style="mitre")
+    return line_of(item).buffer(0.5 * item.width, cap_style="square", join_style="mitre")
 
 
 def _is_thick(drawn: Stroke | Area, bounds: RoomBounds) -> bool:

@@ -19,7 +19,7 @@ from lalaloc_core.importers.common.geometry import extent_of
 from lalaloc_core.importers.common.import_limits import Budget
 from lalaloc_core.importers.common.import_report import ReportBuilder, ScaleClue
 from lalaloc_core.importers.common.sketch import Sketch
-from lalaloc_core.importers.drawing.drawing_scale import Dimension, areas_of_rooms, values_m
+from lalaloc_core.importers.drawing.drawing_scale import Dimension, Scale, areas_of_rooms, values_m
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering
 
 # Logarithms of scales that are compared, around the first one.
@@ -76,6 +76,26 @@ class Measures:
     dimensions: Sequence[Dimension] = ()
     extent: float = 0.0
 
+    @classmethod
+    def of(
+        cls, sketch: Sketch, scale: float, texts: Sequence[Lettering], drawing: Drawing, dimensions: Sequence[Dimension]
+    ) -> Measures:
+        """Return the sizes of the parts in a sketch at a scale, in units of the drawing.
+
+        `texts` are placed in the metres of the sketch, `drawing` has the lines in its own units.
+        """
+        areas = areas_of_rooms([room.shape for room in sketch.rooms], texts)
+        fixtures = [(item.kind, extent_of([item.shape]) / scale) for item in sketch.fixtures if item.kind in _FIXTURE]
+        return cls(
+            [leaf_m / scale for leaf_m in sketch.leaves_m],
+            sketch.wall_m / scale,
+            tread_spacings(stroke.line for stroke in drawing.strokes),
+            fixtures,
+            [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
+            dimensions,
+            extent_of([room.shape for room in sketch.rooms]) / scale if sketch.rooms else 0.0,
+        )
+
 
 @dataclass(frozen=True)
 class ScaleGuess:
@@ -102,9 +122,7 @@ class ScaleGuess:
         )
 
 
-def assume_scale(
-    guess: ScaleGuess | None, builder: ReportBuilder, written: Sequence[tuple[float, str]] = ()
-) -> tuple[float, str] | None:
+def assume_scale(guess: ScaleGuess | None, builder: ReportBuilder, written: Sequence[Scale] = ()) -> Scale | None:
     """Return the only scale written that is near a guessed one, else that as an assumption; None without a guess."""
     if guess is None:
         return None
@@ -173,26 +191,6 @@ def combine(measures: Measures, around: float) -> ScaleGuess | None:
         agrees = abs(own - middle) <= limit
         clues.append(ScaleClue(kind, agreeing.get(kind, count), math.exp(own), own_std, agrees))
     return ScaleGuess(math.exp(middle), std, tuple(clues))
-
-
-def measures_of(
-    sketch: Sketch, scale: float, letterings: Sequence[Lettering], drawing: Drawing, dimensions: Sequence[Dimension]
-) -> Measures:
-    """Return the sizes of the parts in a sketch at a scale, in units of the drawing.
-
-    `letterings` are placed in the metres of the sketch, `drawing` has the lines in its own units.
-    """
-    areas = areas_of_rooms([room.shape for room in sketch.rooms], letterings)
-    fixtures = [(item.kind, extent_of([item.shape]) / scale) for item in sketch.fixtures if item.kind in _FIXTURE]
-    return Measures(
-        [leaf_m / scale for leaf_m in sketch.leaves_m],
-        sketch.wall_m / scale,
-        tread_spacings(stroke.line for stroke in drawing.strokes),
-        fixtures,
-        [(written_m2, area_m2 / scale**2) for written_m2, area_m2 in areas.values()],
-        dimensions,
-        extent_of([room.shape for room in sketch.rooms]) / scale if sketch.rooms else 0.0,
-    )
 
 
 def first_scale(extent: float, leaves: Sequence[float] = ()) -> float:

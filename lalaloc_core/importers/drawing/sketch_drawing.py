@@ -7,7 +7,7 @@ passage without a symbol that is wider than a door are divided where their names
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -17,32 +17,18 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import room_types_from_name
-from lalaloc_core.importers.common.geometry import opening_line, polygons_from_geometry, side_lengths
-from lalaloc_core.importers.common.import_limits import Budget
+from lalaloc_core.importers.common.geometry import clusters, opening_line, polygons_of, side_lengths
+from lalaloc_core.importers.common.import_limits import Budget, CheckTime
 from lalaloc_core.importers.common.import_report import ReportBuilder, Trace, TracePart
 from lalaloc_core.importers.common.plausibility import check_leaves
 from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.drawing.door_leaves import (
-    LEAF_M,
-    drawn_leaves,
-    take_leaves,
-    with_half_open_doors,
-    without_leaves,
-)
+from lalaloc_core.importers.drawing.door_leaves import LEAF_M, drawn_leaves, take_leaves, with_swings, without_leaves
 from lalaloc_core.importers.drawing.drawing_scale import check_areas, texts_of_rooms, without_sizes, written_dimensions
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap, find_gaps
 from lalaloc_core.importers.drawing.rooms_in_drawing import GapFinder, choose_reading, marked_rooms, report_unused
-from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale, measures_of
-from lalaloc_core.importers.drawing.vector_drawing import (
-    Area,
-    Drawing,
-    Lettering,
-    Swing,
-    clusters,
-    split_lines,
-    without_frames,
-)
+from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, first_scale, guess_scale
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Swing, split_lines, without_frames
 
 # Letters of a line of prose, and the least number of such lines on a page of text.
 _LINE_LETTERS, _MIN_LINES_OF_TEXT = 25, 8
@@ -68,7 +54,7 @@ def split_named_rooms(
     walls: BaseGeometry,
     closed: Sequence[Gap],
     letterings: Sequence[Lettering],
-    check_time: Callable[[], None],
+    check_time: CheckTime,
 ) -> tuple[list[shapely.Polygon], list[Gap]]:
     """Divide rooms with several names of rooms at gaps between ends of walls that leave a name on both sides.
 
@@ -97,7 +83,7 @@ def split_named_rooms(
 
 
 def _division(
-    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: Callable[[], None]
+    pieces: Sequence[shapely.Polygon], gaps: Sequence[Gap], names: shapely.STRtree, check_time: CheckTime
 ) -> tuple[int, list[shapely.Polygon], tuple[Gap, ...]] | None:
     """Return the number of a piece with its two sides and the gaps between them; None if no gaps divide names."""
     # One passage, or two beside a wall that stands free.
@@ -105,7 +91,7 @@ def _division(
         check_time()
         cut = shapely.union_all([gap.shape for gap in group])
         for index, piece in enumerate(pieces):
-            sides = polygons_from_geometry(piece.difference(cut))
+            sides = polygons_of(piece.difference(cut))
             named = [side for side in sides if len(names.query(side, predicate="contains"))]
             if len(named) == len(sides) == 2 and all(side.area >= _SMALLEST_M2 for side in sides):
                 return index, sides, group
@@ -132,7 +118,13 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             f"a rectangle of {long:.1f} m x {short:.1f} m is taken for the sheet's frame, and was left out with the "
             "lines beside it; if it is a wall, set crop to the walls"
         )
-    drawing = with_half_open_doors(drawing)
+    drawing, plot = drawing.without_plot()
+    if plot is not None:
+        builder.unsure.append(
+            f"an outline of {plot.area:.0f} m² around all walls, of one line, is taken for the plot and was left out; "
+            "if it is a wall, draw both of its faces, or write the name of its room beside it"
+        )
+    drawing = with_swings(drawing)
     _trace_drawing(drawing, budget.trace)
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
     budget.begin("finding doors and walls")
@@ -163,6 +155,12 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
             budget.trace.add("gap", [gap.shape for gap in gaps])
     budget.begin("placing names and openings")
     sketch.rooms = name_rooms(shapes, drawing.letterings, builder, sketch.drawn)
+    for room in (room for room in sketch.rooms if room.name is None and len(sketch.rooms) > 1):
+        if all(shapely.covers(shapely.Polygon(room.shape.exterior), [other.shape for other in sketch.rooms])):
+            builder.warnings.append(
+                f"a room of {room.shape.area:.0f} m² without a name lies around all others; if it is the plot, set "
+                "layers or crop to the walls"
+            )
     if budget.trace is not None:
         budget.trace.add("room", [room.shape for room in sketch.rooms])
     # A leaf shows a door only where it closes a gap; a slanted line elsewhere is not along a wall.
@@ -174,7 +172,8 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
     leaf_m = {index: swing.radius for swing in swings if (index := finder.closed_by(swing)) is not None}
     sketch.leaves_m = list(leaf_m.values()) or [swing.radius for swing in swings]
     drawn_m = [swing.radius for swing in (*drawing.swings, *leaves)]
-    builder.warnings += check_leaves(drawn_m, builder.metres_per_unit)
+    is_sure = any(finder.closed_by(swing) is not None for swing in drawing.swings)
+    builder.warnings += check_leaves(drawn_m, builder.metres_per_unit, 1 if is_sure else 2)
     sketch.wall_m = float(np.median([side_lengths(gap.shape)[0] for gap in gaps])) if gaps else 0.0
     taken = shapely.STRtree([opening.line.buffer(0.3) for opening in sketch.openings])
     rooms = shapely.STRtree([room.shape for room in shapes])
@@ -191,6 +190,7 @@ def sketch_drawing(drawing: Drawing, builder: ReportBuilder, budget: Budget) -> 
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
                 f"window; it is taken for a {kind}"
             )
+            builder.places[builder.unsure[-1]] = line
     budget.check_time()
     return sketch
 
@@ -204,7 +204,7 @@ def guess_drawing(drawing: Drawing, budget: Budget, *, flip_y: bool) -> ScaleGue
     def measure(scale: float) -> Measures:
         scaled = drawing.scaled(scale, flip_y=flip_y)
         sketch = sketch_drawing(scaled, ReportBuilder(), budget)
-        return measures_of(sketch, scale, scaled.letterings, drawing, dimensions)
+        return Measures.of(sketch, scale, scaled.letterings, drawing, dimensions)
 
     start = first_scale(drawing.extent, [swing.radius for swing in drawing.swings])
     return guess_scale(measure, start, budget)
@@ -254,11 +254,10 @@ def name_rooms(
     Names of rooms that are written in no room, but in the box `drawn` around the walls, give a warning.
     """
     texts, outside = texts_of_rooms([area.shape for area in shapes], letterings)
-    lost = [found for found in outside if drawn is not None and drawn.covers(shapely.Point(found.position))]
-    if named := list(dict.fromkeys(f"'{found.text}'" for found in _names(lost) if found.room_types)):
-        builder.warnings.append(
-            f"no room was found where {', '.join(named[:_MAX_OTHERS])} is written; close its walls, or draw the room"
-        )
+    for found in _names(outside):
+        if drawn is not None and found.room_types and drawn.covers(place := shapely.Point(found.position)):
+            line = f"no room was found where '{found.text}' is written; close its walls, or draw the room"
+            builder.warnings, builder.places[line] = [*builder.warnings, line], place
     rooms = []
     for area, inside in zip(shapes, texts, strict=True):
         words = _names(inside)
@@ -273,6 +272,7 @@ def name_rooms(
                 f"{names} are written in one room of {area.shape.area:.0f} m²; if they are two rooms, draw the wall "
                 "between them"
             )
+            builder.places[builder.warnings[-1]] = area.shape
     check_areas(rooms, [[raw.text for raw in inside] for inside in texts], [raw.text for raw in outside], builder)
     unnamed = sum(room.name is None for room in rooms)
     if unnamed:

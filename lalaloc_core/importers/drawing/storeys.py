@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -19,13 +19,14 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.floorplan.plan_words import Role
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, keys_by_word, split_words
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_from_geometry, segments_of
+from lalaloc_core.importers.common.geometry import extent_of, lines_of, polygons_of, segments_of
 from lalaloc_core.importers.common.sketch import Level, Sketch, T
 from lalaloc_core.importers.drawing.sketch_drawing import sketch_drawing
-from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
+from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, joined, line_of
 
 Box = tuple[float, float, float, float]
 # Rooms farther apart (m) are of different storeys; in pictures, also those that no wall joins within the second.
@@ -48,6 +49,8 @@ _NUMBERED = re.compile(
 _OTHER_SCRIPTS = re.compile(r"(\d{1,2}) ?(?:[階层層]|этаж)", re.IGNORECASE)
 # Height of a storey: "Muro +3.00".
 _HEIGHT = re.compile(r"(?:[+±]|(?<![^\s_])-)\d{1,3}[.,]\d{2}(?!\d)")
+# Least height (m) of a storey.
+_CEILING_M = 2.0
 # Parts of names of layers, and share of a smaller storey's box that one covers.
 _PARTS, _OVER = re.compile(r"[^\w+]+|_"), 0.5
 # Lines nearer than this (m) are the same. Share of an outline that storeys over each other both run along, and of the
@@ -77,15 +80,18 @@ def assemble_storeys(
     builder.levels = tuple(level.name for level in levels)
     named = _in_words(storeys, in_file, levels)
 
-    def make(level: Level, part: tuple[Sketch, list[shapely.Polygon]]) -> ImportedPlan:
-        own, no_room = part
+    def make(level: Level, part: tuple[Sketch, list[shapely.Polygon], list[str]]) -> ImportedPlan:
+        own, no_room, said = part
         report = replace(deepcopy(builder), no_room=no_room)
+        others = builder.places.keys() - set(said)
+        for lines in (report.warnings, report.unsure, report.rejected_texts):
+            lines[:] = [line for line in lines if line not in others]
         report.warnings.append(
             f"{named}; this plan is '{level.name}': choose another with level or crop, or import all levels as a venue"
         )
         return assemble(replace(own, level=level), report, options, budget.limits.plan)
 
-    parts = zip(levels, _parts(sketch, builder.no_room, storeys), strict=True)
+    parts = zip(levels, _parts(sketch, builder, storeys), strict=True)
     return assemble_levels({level.name: (level, part) for level, part in parts}, options, budget, make)
 
 
@@ -99,7 +105,7 @@ def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
         return [shapely.union_all(rooms)]
     reach_m = 0.5 * (_APART_M if sketch.walls is None else _JOINED_M)
     drawn = [*rooms, *([] if sketch.walls is None else [sketch.walls])]
-    parts = polygons_from_geometry(shapely.union_all(shapely.buffer(drawn, reach_m)))
+    parts = polygons_of(shapely.union_all(shapely.buffer(drawn, reach_m)))
     # Walls can be thousands of parts without a room, such as letters.
     room, part = shapely.STRtree(parts).query(rooms, predicate="intersects")
     areas = np.bincount(part, shapely.area(rooms)[room], minlength=len(parts))
@@ -111,15 +117,20 @@ def storeys_beside(sketch: Sketch) -> list[BaseGeometry]:
 
 
 def _parts(
-    sketch: Sketch, no_room: Sequence[shapely.Polygon], storeys: Sequence[BaseGeometry]
-) -> list[tuple[Sketch, list[shapely.Polygon]]]:
-    """Return each storey's part of a sketch, and of the areas that became no room."""
+    sketch: Sketch, builder: ReportBuilder, storeys: Sequence[BaseGeometry]
+) -> list[tuple[Sketch, list[shapely.Polygon], list[str]]]:
+    """Return each storey's part of a sketch, of the areas that became no room, and of the lines about a place."""
     rooms = _by_nearest(sketch.rooms, [room.shape for room in sketch.rooms], storeys)
     openings = _by_nearest(sketch.openings, [opening.line for opening in sketch.openings], storeys)
     fixtures = _by_nearest(sketch.fixtures, [fixture.shape for fixture in sketch.fixtures], storeys)
-    lost = _by_nearest(no_room, no_room, storeys)
+    lost = _by_nearest(builder.no_room, builder.no_room, storeys)
+    said = _by_nearest(list(builder.places), list(builder.places.values()), storeys)
     return [
-        (replace(sketch, rooms=rooms[index], openings=openings[index], fixtures=fixtures[index]), lost[index])
+        (
+            replace(sketch, rooms=rooms[index], openings=openings[index], fixtures=fixtures[index]),
+            lost[index],
+            said[index],
+        )
         for index in range(len(storeys))
     ]
 
@@ -204,11 +215,12 @@ def _in_words(storeys: Sequence[BaseGeometry], in_file: Callable[[Box], Box], le
 
 
 def by_storey(
-    drawing: Drawing, builder: ReportBuilder, options: ImportOptions, budget: Budget, *, flip_y: bool
+    drawings: Mapping[float, Drawing], builder: ReportBuilder, options: ImportOptions, budget: Budget, *, flip_y: bool
 ) -> tuple[ImportedPlan, ...]:
-    """Return the plans of the storeys of a vector drawing in its own units; most drawings have one."""
+    """Return the plans of the storeys of vector drawings by height, in their own units; most files have one."""
     unit = builder.metres_per_unit
-    drawing = drawing.scaled(unit, flip_y=flip_y)
+    scaled = {height * unit: drawings[height].scaled(unit, flip_y=flip_y) for height in sorted(drawings)}
+    drawing = joined(scaled.values())
 
     def in_units(box: Box) -> Box:
         x0, y0, x1, y1 = (number / unit for number in box)
@@ -223,35 +235,46 @@ def by_storey(
 
     def make_level(level: Level, part: Drawing) -> ImportedPlan:
         report = deepcopy(builder)
-        report.notes.append(f"storey '{level.name}' by the names of layers; layers without a storey belong to all")
+        numbers = {other.number for other, _ in storeys.values()} - {level.number}
+        others = {layer for layer, _ in builder.uses if (found := _storey(layer)) and found[1] in numbers}
+        report.uses = Counter({use: count for use, count in builder.uses.items() if use[0] not in others})
+        report.warnings = [line for line in builder.warnings if not any(f"'{x[:50]}'" in line for x in others)]
+        is_by_height = len(by_height) == len(storeys)
+        told_by = "the heights of its lines" if is_by_height else "the names of layers; others belong to all"
+        report.notes.append(f"storey '{level.name}' by {told_by}")
         return make(part, report, level)
 
-    storeys = storeys_of(drawing, builder)
+    roles = {item.role for item in drawing.lines}
+    main = "wall" if "wall" in roles else "room" if "room" in roles else None
+    by_height = _by_height(scaled, main)
+    # Layers name storeys better than heights, which divide what is on other layers.
+    storeys = storeys_of(drawing, main, builder if not by_height else ReportBuilder()) or by_height
+    if len(storeys) == len(by_height):
+        levels = sorted((level for level, _ in storeys.values()), key=lambda level: level.number or 0.0)
+        parts = (part for _, part in by_height.values())
+        storeys = {level.name: (level, part) for level, part in zip(levels, parts, strict=True)}
     return assemble_levels(storeys, options, budget, make_level) if storeys else (make(drawing, builder, None),)
 
 
-def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Level, Drawing]]:
-    """Return the parts of a drawing by storey; empty if its walls are of one.
+def storeys_of(drawing: Drawing, main: Role | None, builder: ReportBuilder) -> dict[str, tuple[Level, Drawing]]:
+    """Return the parts of a drawing by storey; empty if its walls, the lines of the role `main`, are of one.
 
     Layers of walls named by words for storeys are over each other. Numbers can count walls as well: they are storeys if
     their walls run around the same outline. Other layers give a warning then.
     """
-    drawn = (*drawing.strokes, *drawing.areas)
-    main = next((role for role in ("wall", "room") if any(item.role == role for item in drawn)), None)
     walls: defaultdict[float | str, list[BaseGeometry]] = defaultdict(list)
     names: dict[float | str, str] = {}
-    for item in (item for item in drawn if item.role == main):
+    for item in (item for item in drawing.lines if item.role == main):
         name, number = _storey(item.layer) or (item.layer, item.layer)
         if names.get(number, "0").isdecimal():
             names[number] = name
-        walls[number].append(item.line if isinstance(item, Stroke) else item.shape.boundary)
+        walls[number].append(line_of(item))
     largest = sorted(walls, key=lambda key: -shapely.length(walls[key]).sum())[:_MOST_COMPARED]
     around = {key for a, b in combinations(largest, 2) if _are_over_each_other(walls[a], walls[b]) for key in (a, b)}
     by_word = {key for key in walls if main and not names[key].isdecimal()}
     storeys = [key for key in walls if isinstance(key, float) and key in around | by_word]
     boxes = {number: shapely.box(*shapely.total_bounds(walls[number])) for number in storeys}
-    pairs = combinations(boxes.values(), 2)
-    if len(boxes) < 2 or not all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in pairs):
+    if len(boxes) < 2 or not _overlap([*boxes.values()]):
         if around:
             layers = " and ".join(f"'{names[key]}'" for key in walls if key in around)
             builder.warnings.append(
@@ -271,6 +294,34 @@ def storeys_of(drawing: Drawing, builder: ReportBuilder) -> dict[str, tuple[Leve
     return {names[number]: (Level(names[number], number), part(number)) for number in boxes}
 
 
+def _by_height(drawings: Mapping[float, Drawing], main: Role | None) -> dict[str, tuple[Level, Drawing]]:
+    """Return the parts of drawings in metres, by their heights from the lowest, by storey; empty if walls are of one.
+
+    A storey is higher than the last by a ceiling, and has other lines or texts: not the upper edges of walls alone.
+    """
+    walls = {height: [line_of(item) for item in part.lines if item.role == main] for height, part in drawings.items()}
+    trees = {height: shapely.STRtree(lines_of(segments_of(lines))) for height, lines in walls.items()}
+    lengths = {height: shapely.length(lines).sum() for height, lines in walls.items()}
+    floors: list[float] = []
+    for height in (height for height in drawings if lengths[height] > _SHARE * max(lengths.values())):
+        if not floors or (
+            height - floors[-1] >= _CEILING_M
+            and (drawings[height].letterings or not _is_copy(trees[height], trees[floors[-1]]))
+        ):
+            floors.append(height)
+    if len(floors) < 2 or not _overlap([shapely.box(*shapely.total_bounds(walls[floor])) for floor in floors]):
+        return {}
+    parts: dict[float, list[Drawing]] = {floor: [] for floor in floors}
+    for height, part in drawings.items():
+        parts[max([floors[0], *(floor for floor in floors if floor <= height)])].append(part)
+    levels = {floor: Level(f"{floor:+.2f}", floor, floor) for floor in floors}
+    return {level.name: (level, joined(parts[floor])) for floor, level in levels.items()}
+
+
+def _overlap(boxes: Sequence[shapely.Polygon]) -> bool:
+    return all(a.intersection(b).area >= _OVER * min(a.area, b.area) for a, b in combinations(boxes, 2))
+
+
 def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeometry]) -> bool:
     """Return whether the lines of both run around most of the same outline, and both have others as well."""
     hulls = shapely.convex_hull([shapely.GeometryCollection(group) for group in (first, second)])
@@ -283,12 +334,17 @@ def _are_over_each_other(first: Sequence[BaseGeometry], second: Sequence[BaseGeo
     for tree, other in (trees, trees[::-1]):
         near = tree.geometries[tree.query(along, predicate="dwithin", distance=_SAME_LINE_M)]
         along = along.intersection(shapely.union_all(near).buffer(_SAME_LINE_M))
-        middles = shapely.line_interpolate_point(tree.geometries, 0.5, normalized=True)
-        shared = np.unique(other.query(middles, predicate="dwithin", distance=_SAME_LINE_M)[0])
-        lengths = shapely.length(tree.geometries)
-        if lengths[shared].sum() > (1.0 - _OWN) * lengths.sum():
+        if _is_copy(tree, other):
             return False
     return along.length >= least
+
+
+def _is_copy(tree: shapely.STRtree, other: shapely.STRtree) -> bool:
+    """Return whether nearly all pieces of lines run along others."""
+    middles = shapely.line_interpolate_point(tree.geometries, 0.5, normalized=True)
+    shared = np.unique(other.query(middles, predicate="dwithin", distance=_SAME_LINE_M)[0])
+    lengths = shapely.length(tree.geometries)
+    return bool(lengths[shared].sum() > (1.0 - _OWN) * lengths.sum())
 
 
 @lru_cache(maxsize=1024)

@@ -9,6 +9,8 @@ import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
+from typing import ClassVar
 
 import numpy as np
 import shapely
@@ -19,23 +21,23 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.plan_words import Role, room_types_from_reading
 from lalaloc_core.floorplan.room_types import PLAN_WORDS, room_types_from_name, split_words
 from lalaloc_core.importers.common.geometry import (
-    check_network,
     distinct,
     even_odd_polygons,
     extent_of,
     lines_of,
     point_xy,
+    polygons_of,
     segments_of,
     side_lengths,
 )
+from lalaloc_core.importers.common.import_limits import CheckTime
+from lalaloc_core.importers.common.room_bounds import ROOM_BOUNDS
 from lalaloc_core.importers.common.sketch import SketchedFixture
 
 # Of 255: fills of lower luminance can be walls, channels of white are not lower, and glass is bluer than red by this.
 _DARK, _WHITE, _BLUER = 110.0, 250.0, 20.0
 # Least opacity (of 255) of what can be seen, and of fills that hide what is below them.
 _VISIBLE, _HIDING = 60.0, 230.0
-# Straight pieces per curve.
-CURVE_STEPS = 12
 # Angles of a door swing, and the largest deviation of its radius (share).
 _SWING_DEG = (55.0, 125.0)
 _ROUND = 0.03
@@ -169,6 +171,11 @@ class Drawing:
         return len(self.areas) + len(self.strokes) + len(self.patches)
 
     @property
+    def lines(self) -> list[Area | Stroke]:
+        """Areas and lines, whose outlines can be walls."""
+        return [*self.areas, *self.strokes]
+
+    @property
     def shapes(self) -> list[BaseGeometry]:
         """Areas and lines."""
         return [*(area.shape for area in self.areas), *(stroke.line for stroke in self.strokes)]
@@ -196,6 +203,29 @@ class Drawing:
         """Return the drawing without white lines, which hide others, unless most is white, as on a dark ground."""
         seen = [stroke for stroke in self.strokes if not stroke.is_white or stroke.role is not None]
         return replace(self, strokes=seen) if 2 * len(seen) + len(self.areas) > len(self.strokes) else self
+
+    def without_plot(self) -> tuple[Drawing, shapely.Polygon | None]:
+        """Return a drawing in metres without the outline of the plot around its walls, and this outline, if any.
+
+        It is one thin line around all others, away from them and from names of rooms; without names, walls have faces.
+        """
+        light = [item for item in self.lines if not getattr(item, "is_dark", False) and item.role in (None, "wall")]
+        thin = [item for item in light if item.width < ROOM_BOUNDS.thick_m[0]]
+        faces = polygons_of(shapely.polygonize(shapely.get_parts(list(map(line_of, thin))).tolist()))
+        plot = shapely.Polygon(max(faces, key=lambda face: face.envelope.area, default=shapely.Polygon()).exterior)
+        edge = plot.exterior.buffer(_ON_BOX_M)
+        own = {id(item) for item in thin if edge.covers(line_of(item))}
+        rest = [item for item in self.lines if id(item) not in own]
+        walls = shapely.GeometryCollection(list(map(line_of, rest)))
+        named = [shapely.Point(text.position) for text in self.letterings if set(text.room_types) - {"balcony"}]
+        names = [place for place in named if plot.covers(place)]
+        thickest_m = ROOM_BOUNDS.walls.thickest
+        is_walled = len(light) < len(self.lines) or any(face.buffer(-0.5 * thickest_m).is_empty for face in faces)
+        is_plot = all(map(walls.convex_hull.covers, names)) if names else is_walled
+        if not is_plot or not rest or not plot.buffer(-_BESIDE_FRAME_M).covers(walls):
+            return self, None
+        areas, strokes = ([item for item in rest if isinstance(item, kind)] for kind in (Area, Stroke))
+        return replace(self, areas=areas, strokes=strokes), plot
 
     def on_layers(self, is_wanted: Callable[[str], bool]) -> Drawing:
         """Return what is on some layers; patches, which have none, stay."""
@@ -235,16 +265,25 @@ class Drawing:
         )
 
 
-def without_frames(
-    drawing: Drawing, check_time: Callable[[], None], most: int = 4
-) -> tuple[Drawing, list[BaseGeometry]]:
+def line_of(item: Area | Stroke) -> BaseGeometry:
+    """Return a line, or the boundary of an area."""
+    return item.line if isinstance(item, Stroke) else item.shape.boundary
+
+
+def joined(drawings: Iterable[Drawing]) -> Drawing:
+    """Return drawings as one."""
+    kinds = zip(*(vars(drawing).values() for drawing in drawings), strict=True)
+    return Drawing(*(list(chain.from_iterable(items)) for items in kinds))
+
+
+def without_frames(drawing: Drawing, check_time: CheckTime, most: int = 4) -> tuple[Drawing, list[BaseGeometry]]:
     """Return a drawing in metres without the frames of its sheet and what they touch, such as a title block; and these.
 
     A frame is a rectangle around most lines, which are away from it, of a sheet's proportions or with a title. Up to
     `most` frames around each other are found. `check_time` raises an exception to stop.
     """
-    items = [*drawing.areas, *drawing.strokes]
-    lines = [item.line if isinstance(item, Stroke) else item.shape.boundary for item in items]
+    items = drawing.lines
+    lines = list(map(line_of, items))
     if not items or not most:
         return drawing, []
     tree, whole = shapely.STRtree(lines), shapely.box(*shapely.total_bounds(lines))
@@ -277,7 +316,7 @@ def without_frames(
     return drawing, []
 
 
-def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[], None]) -> set[int]:
+def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: CheckTime) -> set[int]:
     """Return the numbers of the lines that are connected with a frame, or are beside it."""
     found, new = set[int](), [frame]
     while new:
@@ -294,6 +333,8 @@ def _beside(tree: shapely.STRtree, frame: BaseGeometry, check_time: Callable[[],
 class Subpath:
     """Part of a path: its points, its curves (runs of curved pieces), and whether it is closed."""
 
+    # Straight pieces per curve.
+    STEPS: ClassVar[int] = 12
     points: list[tuple[float, float]] = field(default_factory=list)
     curves: list[list[tuple[float, float]]] = field(default_factory=list)
     is_closed: bool = False
@@ -314,10 +355,8 @@ def leaves_of(curves: Sequence[Float[np.ndarray, "_ 2"]], layer: str = "") -> li
     return [swing for swing in swings if swing is not None]
 
 
-def fit_swing(
-    points: Float[np.ndarray, "n 2"], layer: str, angles_deg: tuple[float, float] = _SWING_DEG
-) -> Swing | None:
-    """Return the arc that a curve follows, None if its angle is outside `angles_deg` or it is not round."""
+def fit_swing(points: Float[np.ndarray, "n 2"], layer: str, turn_deg: tuple[float, float] = _SWING_DEG) -> Swing | None:
+    """Return the arc that a curve follows, None if its angle is outside `turn_deg` or it is not round."""
     if len(points) < 4 or not np.isfinite(points).all():
         return None
     middle = points.mean(axis=0)
@@ -333,7 +372,7 @@ def fit_swing(
     if radius <= 0.0 or float(np.abs(radii - radius).max()) > _ROUND * radius:
         return None
     angles = np.unwrap(np.arctan2(*(local - centre).T[::-1]))
-    if not angles_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= angles_deg[1]:
+    if not turn_deg[0] <= math.degrees(float(abs(angles[-1] - angles[0]))) <= turn_deg[1]:
         return None
     hinge, first, last = centre + middle, points[0], points[-1]
     return Swing(point_xy(hinge), point_xy(first), point_xy(last), layer)
@@ -347,16 +386,3 @@ def split_lines(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
             f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
         )
     return lines_of(pieces)
-
-
-def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
-    """Group shapes that are near each other into one geometry each."""
-    if not shapes:
-        return []
-    check_network(shapes)
-    around = shapely.union_all(shapely.buffer(shapes, 0.5 * reach_m, quad_segs=2))
-    tree = shapely.STRtree(shapely.get_parts(around))
-    members: dict[int, list[BaseGeometry]] = {}
-    for index, region in zip(*tree.query(shapes, predicate="intersects").tolist(), strict=True):
-        members.setdefault(region, []).append(shapes[index])
-    return [shapely.GeometryCollection(group) for group in members.values()]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,11 +24,13 @@ from ezdxf import recover
 from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dxfentity import DXFEntity, DXFTagStorage
 from ezdxf.entities.dxfgfx import DXFGraphic
+from ezdxf.entities.hatch import Hatch
 from ezdxf.entities.image import Image
 from ezdxf.entities.insert import Insert
 from ezdxf.entities.layer import Layer
 from ezdxf.entities.lwpolyline import LWPolyline
 from ezdxf.entities.mline import MLine
+from ezdxf.entities.mpolygon import MPolygon
 from ezdxf.entities.mtext import MText
 from ezdxf.entities.polyline import Polyface, Polyline, Polymesh
 from ezdxf.entities.text import Text
@@ -43,17 +45,17 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
-from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import even_odd_polygons, in_range, label_position, polygons_of
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.storeys import by_storey
-from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, leaves_of
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Stroke, joined, leaves_of
 from lalaloc_core.importers.formats.dxf_unit import find_unit
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _STRAIGHT = {"LINE", "LWPOLYLINE", "POLYLINE"}
-_FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
+_FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE", "3DFACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
-_READ = _LINES | _FILLED | _TEXTS | {"INSERT", "3DFACE"}
+_READ = _LINES | _FILLED | _TEXTS | {"INSERT"}
 # Alignments of texts that reach from one point to another. Half of the width of a letter and of the distance of lines,
 # relative to the height of letters, and letters of a name.
 _BETWEEN, _HALF_LETTER, _HALF_LINE, _LETTERS = (3, 5), 0.3, 0.8, 12
@@ -74,6 +76,8 @@ _MAX_BLOCK_DEPTH = 16
 _BYTES_PER_SHAPE = 10
 # Maximum distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
+# Members with a point of an entity, and heights that are told apart.
+_PLACES, _MOST_HEIGHTS = ("start", "center", "insert", "elevation", "vtx0", "location"), 1000
 # Largest relation of the widths of a polyline that are one.
 _SAME_WIDTH = 1.05
 # A polyline is closed if its ends are nearer than this share of its length. The distance to the origin must not matter,
@@ -100,15 +104,16 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     document = _open(content)
     _check_blocks(document, budget)
     builder = ReportBuilder("dxf")
-    drawing = _read_drawing(document, options, builder, budget)
+    drawings: Mapping[float, Drawing] = _read_drawings(document, options, builder, budget)
     if options.crop is not None:
-        drawing = drawing.cropped(options.crop)
-    builder.metres_per_unit, builder.scale_source = find_unit(document, drawing, options, builder, budget)
+        drawings = {height: drawing.cropped(options.crop) for height, drawing in drawings.items()}
+    whole = joined(drawings.values())
+    builder.metres_per_unit, builder.scale_source = find_unit(document, whole, options, builder, budget)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
             "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis == "down")
+    return by_storey(drawings, builder, options, budget, flip_y=options.y_axis == "down")
 
 
 @contextmanager
@@ -161,9 +166,7 @@ def _open(content: bytes) -> DxfDocument:
             content = text.getvalue().encode()
         document, _ = recover.read(io.BytesIO(content))
     except (DXFError, OSError, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise InvalidFloorPlanError(
-            "the DXF is damaged and cannot be read; save it again, as DXF R2010 or later"
-        ) from error
+        raise InvalidFloorPlanError("the DXF is damaged and cannot be read; save it as DXF R2010 or later") from error
     return document
 
 
@@ -211,8 +214,11 @@ def _weight(entity: DXFEntity) -> int:
     return 1
 
 
-def _read_drawing(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
-    drawing = Drawing()
+def _read_drawings(
+    document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget
+) -> dict[float, Drawing]:
+    """Return what is drawn at each height."""
+    drawings: defaultdict[float, Drawing] = defaultdict(Drawing)
     states = (Layer.is_off, Layer.is_frozen, lambda layer: not layer.dxf.plot)
     off, frozen, unplotted = (frozenset(x.dxf.name.casefold() for x in document.layers if state(x)) for state in states)
     low, high = document.header.get("$EXTMIN", (0, 0, 0)), document.header.get("$EXTMAX", (0, 0, 0))
@@ -221,7 +227,8 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
     sag = _SAG * size if 0.0 < size < 1e9 else 0.01
     missing = _count_missing(document, builder)
     for entity, context in _walk(document.modelspace(), None, 0, budget, frozen):
-        layer = context.layer.casefold()
+        layer, height = context.layer.casefold(), _height(entity)
+        drawing = drawings[height if height in drawings or len(drawings) < _MOST_HEIGHTS else 0.0]
         if layer in off | frozen or entity.dxf.get("invisible", 0):
             builder.use(context.layer, f"ignored ({'layer is off' if layer in off | frozen else 'invisible'})")
         elif layer in unplotted and context.role is None and not options.layers:
@@ -244,13 +251,23 @@ def _read_drawing(document: DxfDocument, options: ImportOptions, builder: Report
                 missing[subject, f" is not read: {_REMEDIES.get(kind, 'explode it (EXPLODE)')}"] += 1
     for (subject, remedy), count in missing.items():
         builder.warnings.append(f"{subject}{f' ({count} times)' if count > 1 else ''}{remedy}")
-    if options.layers and not drawing.areas and not drawing.strokes:
+    if options.layers and not any(drawing.shapes for drawing in drawings.values()):
         available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
             f"layers is {', '.join(options.layers)[:200]}, but these layers are empty; "
             f"layers of the drawing: {', '.join(repr(layer) for layer in available) or 'none'}"
         )
-    return drawing
+    return drawings
+
+
+def _height(entity: DXFGraphic) -> float:
+    """Return the height of a point of an entity, in the file's unit."""
+    source = (
+        entity.vertices[0] if isinstance(entity, Polyline) and entity.is_3d_polyline and entity.vertices else entity
+    )
+    stated = next((source.dxf.get(key) for key in _PLACES if source.dxf.hasattr(key)), 0.0)
+    height = float(stated if isinstance(stated, float | int) else stated[2])
+    return round(height, 6) if in_range(np.array(height)) else 0.0
 
 
 def _is_dashed(entity: DXFGraphic, context: _Context, document: DxfDocument) -> bool:
@@ -346,10 +363,11 @@ def _add(
     if isinstance(entity, Insert):
         _add_block(entity, context, drawing, builder, sag, budget)
     elif kind in _FILLED:
-        shapes = _filled_areas(entity, sag)
-        is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
+        shapes, is_face = _filled_areas(entity, sag), kind == "3DFACE"
+        is_solid = None if is_face else kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
         drawing.areas += [Area(shape, context.layer, role, is_dark=is_solid) for shape in shapes]
-        builder.use(context.layer, f"hatches: {role or 'possible walls'}", max(len(shapes), 1))
+        used_as = f"{'faces' if is_face else 'hatches'}: {role or 'possible walls'}"
+        builder.use(context.layer, used_as if shapes or not is_face else "ignored", max(len(shapes), 1))
     elif kind in _LINES:
         parts: Iterable[DXFGraphic] = (entity,)
         if isinstance(entity, LWPolyline) and entity.has_arc and not entity.closed and role in (None, "wall", "door"):
@@ -357,11 +375,6 @@ def _add(
             parts = entity.virtual_entities()
         for part in parts:
             _add_line(part, context, drawing, builder, sag)
-    elif kind == "3DFACE":
-        corners = np.array([(corner.x, corner.y) for corner in entity.wcs_vertices()])  # type: ignore[attr-defined]
-        faces = polygons_from_geometry(shapely.Polygon(corners)) if in_range(corners) else []
-        drawing.areas += [Area(face, context.layer, role) for face in faces]
-        builder.use(context.layer, f"faces: {role or 'possible walls'}" if faces else "ignored")
 
 
 def _anchor(entity: DXFGraphic) -> tuple[float, float] | None:
@@ -411,7 +424,8 @@ def _add_block(
 
 
 def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
-    points = _points(entity, sag)
+    points = next(iter(_rings(entity, sag)), np.empty((0, 2)))
+    points = points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])[: len(points)]]
     if len(points) < 2:
         builder.use(context.layer, "ignored (no length, or coordinates out of range)")
         return
@@ -425,7 +439,7 @@ def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: 
         drawing.swings += leaves
         builder.use(context.layer, "door swings")
     elif len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
-        shapes = polygons_from_geometry(shapely.Polygon(points))
+        shapes = polygons_of(shapely.Polygon(points))
         drawing.areas += [Area(shape, context.layer, role, width=width) for shape in shapes]
         builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
@@ -454,15 +468,13 @@ def _ends_meet(points: np.ndarray) -> bool:
     return len(points) > 3 and float(np.linalg.norm(points[0] - points[-1])) <= _CLOSED * length
 
 
-def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
-    """Return the points along a line, in world coordinates seen from above."""
+def _rings(entity: DXFGraphic, sag: float) -> list[Float[np.ndarray, "_ 2"]]:
+    """Return the points along a line or each outline of an area, in world coordinates seen from above, if in range."""
     try:
-        points = _flatten(dxf_path.make_path(entity), sag)
+        paths = dxf_path.from_hatch(entity) if isinstance(entity, Hatch | MPolygon) else [dxf_path.make_path(entity)]
+        return [ring for path in paths if len(ring := _flatten(path, sag)) and in_range(ring)]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
-        return np.empty((0, 2))
-    if not len(points) or not in_range(points):
-        return np.empty((0, 2))
-    return points[np.concatenate([[True], np.any(np.diff(points, axis=0) != 0.0, axis=1)])]
+        return []
 
 
 def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
@@ -475,12 +487,6 @@ def _flatten(path: dxf_path.Path, sag: float) -> Float[np.ndarray, "n 2"]:
 
 
 def _filled_areas(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
-    """Return the filled area of a hatch, between its outlines."""
-    try:
-        is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
-        paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [_flatten(path, sag) for path in paths]
-    except (TypeError, ValueError, ZeroDivisionError, DXFError):
-        return []
-    usable = [ring for ring in rings if len(ring) >= 4 and in_range(ring)]
-    return even_odd_polygons(part for ring in usable for part in polygons_from_geometry(shapely.Polygon(ring)))
+    """Return the filled area of a hatch, between its outlines, or of a face."""
+    rings = (shapely.Polygon(ring) for ring in _rings(entity, sag) if len(ring) >= 4)
+    return even_odd_polygons(part for ring in rings for part in polygons_of(ring))

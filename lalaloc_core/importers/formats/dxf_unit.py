@@ -13,7 +13,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.importers.common.plausibility import UNIT_NAMES, likely_unit, unit_hints
-from lalaloc_core.importers.drawing.drawing_scale import Dimension, drawing_scale, scale_by_dimensions
+from lalaloc_core.importers.drawing.drawing_scale import Dimension, Scale, drawing_scale, scale_by_dimensions
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
 from lalaloc_core.importers.drawing.vector_drawing import Drawing
@@ -33,7 +33,7 @@ _NEAR_STDS, _NEAR = 3.0, 0.1
 
 def find_unit(
     document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget
-) -> tuple[float, str]:
+) -> Scale:
     """Return the metres per unit and their source: the options, $INSUNITS, the dimensions, or sizes of parts."""
     code = document.header.get("$INSUNITS", 0)
     if not drawing.shapes:
@@ -58,9 +58,7 @@ def find_unit(
     return factor, source
 
 
-def _assumed_unit(
-    drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget
-) -> tuple[float, str] | None:
+def _assumed_unit(drawing: Drawing, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Scale | None:
     """Return the only unit that is near the scale by the usual sizes of parts, and report it; None without one."""
     guess = guess_drawing(drawing, budget, flip_y=options.y_axis == "down")
     if guess is None:

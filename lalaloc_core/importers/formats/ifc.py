@@ -233,9 +233,7 @@ def _stated_elevation_m(storey: Any, unit: float) -> float:
     return float(getattr(storey, "Elevation", None) or 0.0) * unit
 
 
-def _add_elements(
-    elements: Iterable[Any], floor_m: float, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes
-) -> None:
+def _add_elements(elements: list[Any], floor_m: float, sketch: Sketch, builder: ReportBuilder, meshes: _Meshes) -> None:
     """Add the doors, windows and columns of a storey."""
     for element in elements:
         if (fixture := fixture_kind(element)) is not None:

@@ -39,9 +39,7 @@ def open_model(content: bytes) -> Any:
         )
     # ifcopenshell reads a truncated file without an error, and the rest is missing.
     if _END not in content[-_TAIL_BYTES:]:
-        raise InvalidFloorPlanError(
-            f"the IFC file is truncated: it does not end with {_END.decode()}; export or upload it again"
-        )
+        raise InvalidFloorPlanError(f"the IFC file is truncated: it does not end with {_END.decode()}; export it again")
     # The format is ASCII and escapes other characters, so nothing is lost by "replace".
     text = content.decode("utf-8", "replace")
     stated = _SCHEMA.search(text, 0, _HEAD)
@@ -52,9 +50,7 @@ def open_model(content: bytes) -> Any:
         model = ifcopenshell.file.from_string(_SCHEMA.sub(rf"\g<1>{known}", text, 1) if known != schema else text)
         schema = str(model.schema)
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
-        raise InvalidFloorPlanError(
-            "the IFC model is damaged, so that it cannot be read; export it again as IFC4"
-        ) from error
+        raise InvalidFloorPlanError("the IFC model cannot be read: export it again as IFC4") from error
     if not schema.startswith(("IFC2X3", "IFC4")):
         raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}; export it as IFC2X3 or IFC4")
     _check_placements(model)

@@ -30,9 +30,7 @@ def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> 
     by_type = {name.rpartition("/")[2].partition(".")[0].casefold(): name for name in files}
     if "unit" not in by_type:
         found = ", ".join(sorted(files)[:10]) or "no GeoJSON at all"
-        raise InvalidFloorPlanError(
-            f"the archive has no unit.geojson, it has {found}; send an IMDF archive or one IFC model"
-        )
+        raise InvalidFloorPlanError(f"the archive has no unit.geojson, it has {found}; send IMDF or one IFC model")
     # The standard requires the type in every feature; some tools give it in the file's name only.
     features = [
         replace(feature, properties={"feature_type": kind} | dict(feature.properties))

@@ -6,6 +6,7 @@ geometry gives an exact door, another one a door where its line leaves a cell. h
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
 from lalaloc_core.importers.common.geometry import Floor, check_coordinates, find_floor, opening_line, report_floor
-from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.importers.common.import_options import METRES_PER_UNIT, ImportOptions, to_number
 from lalaloc_core.importers.common.opening_placement import WallLines
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, Level, Point, Sketch, SketchedOpening, SketchedRoom
 
@@ -198,12 +199,11 @@ def _positions(element: Element, budget: Budget) -> Float[np.ndarray, "n 3"]:
     for part in element.iter():
         if local_name(part) not in ("pos", "posList"):
             continue
-        try:
-            values = [float(text) for text in (part.text or "").split()]
-        except ValueError as error:
+        values = [to_number(text) for text in (part.text or "").split()]
+        if any(map(math.isnan, values)):
             raise InvalidFloorPlanError(
                 f"a position in the IndoorGML file is '{(part.text or '').strip()[:50]}'; positions must be numbers"
-            ) from error
+            )
         size = _dimension(part, values)
         budget.spend(len(values) // size)
         found += [[*values[first : first + size], 0.0][:3] for first in range(0, len(values) - size + 1, size)]

@@ -6,6 +6,7 @@ ways along them. https://wiki.openstreetmap.org/wiki/Simple_Indoor_Tagging
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -17,7 +18,8 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions
 from lalaloc_core.importers.common.bounded_files import read_xml
-from lalaloc_core.importers.common.geometry import check_network, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_network, polygons_of
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.tagged_features import Feature, import_features
 
 _Position = tuple[float, float]
@@ -57,14 +59,11 @@ def _from_xml(content: bytes, budget: Budget) -> list[dict[str, Any]]:
 
 def _decimal(element: Element, key: str) -> float | None:
     text = element.get(key)
-    if text is None:
-        return None
-    try:
-        return float(text)
-    except ValueError as error:
+    if text is not None and math.isnan(to_number(text)):
         raise InvalidFloorPlanError(
             f"{element.tag} {str(element.get('id'))[:20]} has {key} '{text[:50]}'; it must be a number of degrees"
-        ) from error
+        )
+    return None if text is None else to_number(text)
 
 
 def _features(elements: Sequence[Mapping[str, Any]], budget: Budget) -> Iterator[Feature]:
@@ -117,11 +116,9 @@ def _way_shape(points: list[_Position], tags: Mapping[str, Any]) -> BaseGeometry
     return shapely.LineString(points) if len(points) >= 2 else None
 
 
-def _multipolygon(
-    element: Mapping[str, Any], lines: Mapping[Any, list[_Position]], budget: Budget
-) -> BaseGeometry | None:
+def _multipolygon(raw: Mapping[str, Any], lines: Mapping[Any, list[_Position]], budget: Budget) -> BaseGeometry | None:
     """Return the area of a relation; its rings can be divided into several ways."""
-    members = element.get("members")
+    members = raw.get("members")
     rings: dict[bool, list[shapely.LineString]] = {True: [], False: []}
     for member in members if isinstance(members, list) else []:
         if isinstance(member, Mapping) and member.get("type") == "way":
@@ -135,4 +132,4 @@ def _multipolygon(
         check_network(rings[role])
     outer, inner = (shapely.union_all(shapely.get_parts(shapely.polygonize(rings[role]))) for role in (False, True))
     area = shapely.difference(outer, inner)
-    return shapely.MultiPolygon(parts) if (parts := polygons_from_geometry(area)) else None
+    return shapely.MultiPolygon(parts) if (parts := polygons_of(area)) else None

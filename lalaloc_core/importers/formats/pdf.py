@@ -19,14 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.room_types import room_types_from_name
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder, Sketch
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale, written_dimensions
-from lalaloc_core.importers.drawing.scale_guess import (
-    Measures,
-    ScaleGuess,
-    assume_scale,
-    first_scale,
-    guess_scale,
-    measures_of,
-)
+from lalaloc_core.importers.drawing.scale_guess import Measures, ScaleGuess, assume_scale, first_scale, guess_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing, name_rooms, sketch_drawing, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area, Lettering
@@ -56,21 +49,20 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
         if found.hidden:
             named = ", ".join(repr(layer) if layer else "one without a name" for layer in found.hidden)
             budget.hints.append(
-                f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan"
+                f"layers that are switched off in the PDF were not read: {named}; switch on what is of the plan, "
+                "for screens and for print"
             )
         found.crop, paper, shapes = options.crop, options.crop or page.get_bbox(), found.drawing.shapes
         if options.crop is not None or (shapes and not shapely.covers(shapely.box(*paper), shapes).all()):
             found.drawing = found.drawing.cropped(paper)
         notes = list(budget.hints)
         budget.hints += text_hints(found.drawing.letterings, f"page {options.page} of the PDF")
-        return _read_plan(found, notes, options, budget)
+        return _read(found, notes, options, budget)
     finally:
         document.close()
 
 
-def _read_plan(
-    found: PageContent, notes: list[str], options: ImportOptions, budget: Budget
-) -> tuple[ImportedPlan, ...]:
+def _read(found: PageContent, notes: list[str], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     builder = ReportBuilder("pdf", is_draft=True, notes=notes)
     if found.out_of_range:
         builder.notes.append(f"{found.out_of_range} lines were left out, as their coordinates are out of range")
@@ -119,7 +111,7 @@ def _guess(found: PageContent, scan: PictureTexts, budget: Budget) -> ScaleGuess
         # Symbols that are found by their size tell nothing about the scale.
         letterings = found.drawing.scaled(scale, flip_y=False).letterings or scan.placed(scale)
         sketch = _as_picture(found, scale, ReportBuilder(), budget, has_symbols=False, letterings=letterings)
-        return measures_of(sketch, scale, letterings, scan.drawing, dimensions)
+        return Measures.of(sketch, scale, letterings, scan.drawing, dimensions)
 
     return guess_scale(measure, first_scale(0.9 * max(found.size_pt)), budget)
 

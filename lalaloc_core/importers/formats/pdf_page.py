@@ -20,18 +20,9 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common.assemble import clean_name
-from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, point_xy, polygons_of
 from lalaloc_core.importers.common.import_limits import Budget
-from lalaloc_core.importers.drawing.vector_drawing import (
-    CURVE_STEPS,
-    Area,
-    Drawing,
-    Lettering,
-    Paint,
-    Stroke,
-    Subpath,
-    leaves_of,
-)
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Paint, Stroke, Subpath, leaves_of
 
 # Functions that count and return the objects of a page, and those of a form in it.
 _OF_PAGE: Any = pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject
@@ -45,8 +36,9 @@ _BYTES_PER_SHAPE = 4
 # Pixels of the longer side of a page on which hidden objects are looked for, and bytes of the name of a layer.
 _SEEN_PX, _NAME_BYTES = 400, 200
 _LAYER, _USER_UNIT = re.compile(rb"/OC(?:G|MD)\b"), re.compile(rb"/UserUnit\s+(\d{1,5}(?:\.\d{1,9})?)")
-# Members of layers that are shown depending on others.
-_CONDITION, _MARKS_OF_ORDER = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d])[VO]"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
+# Members of layers that are shown depending on others or on their use: on screens or in print.
+_CONDITION = re.compile(rb"/(?=(?:VE|OCGs)\s*[\[\d]|Usage\b)[VOU]")
+_USES, _MARKS_OF_ORDER = (None, "print"), (codecs.BOM_UTF16_BE, codecs.BOM_UTF16_LE)
 _METRES_PER_POINT = 0.0254 / 72.0
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -185,10 +177,10 @@ def _activate(pairs: Sequence[tuple[Any, Any]], *, is_active: bool) -> None:
 
 
 def _pixels(page: pypdfium2.PdfPage) -> UInt8[np.ndarray, "h w c"]:
-    """Return the pixels of the active objects of a page, transparent where there are none."""
-    scale = _SEEN_PX / max(*page.get_size(), 1.0)
-    bitmap = page.render(scale=scale, fill_color=(0, 0, 0, 0), draw_annots=False, may_draw_forms=False)
-    return np.asarray(bitmap.to_numpy())
+    """Return the pixels of the active objects of a page, transparent where there are none on a screen or in print."""
+    look: Any = {"scale": _SEEN_PX / max(*page.get_size(), 1.0), "fill_color": (0, 0, 0, 0), "draw_annots": False}
+    drawn = [page.render(**look, may_draw_forms=False, optimize_mode=use).to_numpy() for use in _USES]
+    return np.minimum(*drawn)
 
 
 def _count_shapes(holder: Any, budget: Budget, depth: int = 0) -> int:
@@ -259,7 +251,7 @@ def _add_path(item: Any, matrix: Matrix, found: PageContent, budget: Budget) -> 
         if leaves:
             drawing.swings += leaves
         elif len(points) >= 3 and (is_filled or (subpath.is_closed and pen is not None)):
-            shells += polygons_from_geometry(shapely.Polygon(points))
+            shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and pen is not None and (line := shapely.LineString(points)).length > 0.0:
             drawing.strokes.append(Stroke(line, "", None, width_pt, drawing.next_order, pen.is_white))
     if shells:
@@ -298,7 +290,7 @@ def _subpaths(item: Any, budget: Budget) -> list[Subpath]:
 def _curve(*control: tuple[float, float]) -> list[tuple[float, float]]:
     """Return the points of a Bézier curve."""
     start, a, b, end = map(np.array, control)
-    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[:, None]
+    t = np.linspace(0.0, 1.0, Subpath.STEPS + 1)[:, None]
     return list(map(point_xy, (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end))
 
 

@@ -9,24 +9,24 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import Tones
 from lalaloc_core.importers.common import Budget, ImportedPlan, ImportOptions, ReportBuilder
 from lalaloc_core.importers.drawing.drawing_scale import (
+    Scale,
     check_scale,
     drawing_scale,
     reject_dimensions,
     scale_by_dimensions,
     written_dimensions,
 )
-from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale, measures_of
+from lalaloc_core.importers.drawing.scale_guess import Measures, assume_scale, first_scale, guess_scale
 from lalaloc_core.importers.drawing.sketch_drawing import name_rooms, text_hints
 from lalaloc_core.importers.drawing.storeys import Box, assemble_storeys
 from lalaloc_core.importers.drawing.vector_drawing import Area
-from lalaloc_core.importers.picture.ink import blank_outside, darken_pale_walls, drawn_extent
+from lalaloc_core.importers.picture.ink import Colours, Gray, blank_outside, darken_pale_walls, drawn_extent
 from lalaloc_core.importers.picture.lettering import read_texts
 from lalaloc_core.importers.picture.occupancy import sketch_map
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
@@ -56,15 +56,13 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     dimensions = written_dimensions(texts.drawing, budget.check_time)
     measured = scale_by_dimensions(dimensions, texts.drawing.extent) if texts.drawing.shapes else None
 
-    def measure(metres_per_pixel: float) -> Measures:
+    def measure(scale: float) -> Measures:
         # Symbols that are found by their size tell nothing about the scale.
-        placed = texts.placed(metres_per_pixel)
-        sketch = sketch_picture(
-            gray, metres_per_pixel, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed
-        )
-        return measures_of(sketch, metres_per_pixel, placed, texts.drawing, dimensions)
+        placed = texts.placed(scale)
+        sketch = sketch_picture(gray, scale, ReportBuilder(), budget, warmth, has_symbols=False, letterings=placed)
+        return Measures.of(sketch, scale, placed, texts.drawing, dimensions)
 
-    def guess(written: Sequence[tuple[float, str]]) -> tuple[float, str] | None:
+    def guess(written: Sequence[Scale]) -> Scale | None:
         first = first_scale(drawn_extent(gray))
         if sketch_map(colours, first, ReportBuilder(), budget) is not None:
             budget.hints.append("maps as robots draw them have no leaves of doors, which would tell the scale")
@@ -108,7 +106,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     return assemble_storeys(sketch, letterings, builder, options, budget, in_file)
 
 
-def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder: ReportBuilder) -> None:
+def _check_kind(gray: Gray, options: ImportOptions, builder: ReportBuilder) -> None:
     """Refuse photographs, unless the options say that the picture is a plan."""
     tones = Tones.of(gray)
     if tones is None or not tones.is_photograph:
@@ -121,11 +119,9 @@ def _check_kind(gray: UInt8[np.ndarray, "h w"], options: ImportOptions, builder:
     builder.notes.append("the picture looks like a photograph and was read as a plan, because plan=true is set")
 
 
-def _open(
-    content: bytes, builder: ReportBuilder, budget: Budget
-) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, UInt8[np.ndarray, "h w 3"], float | None]:
+def _open(content: bytes, builder: ReportBuilder, budget: Budget) -> tuple[Gray, Gray | None, Colours, float | None]:
     """Return the grey picture on white, its warmth, its colours, and the length of a pixel on paper if it is given."""
-    with open_picture(content, ("PNG", "JPEG"), "the picture", "save it again as PNG", budget) as picture:
+    with open_picture(content, ["PNG", "JPEG"], "the picture", "save it again as PNG", budget) as picture:
         if min(picture.size) < _MIN_SIDE_PX:
             raise InvalidFloorPlanError(
                 f"the picture has {picture.width} x {picture.height} pixels; the minimum is {_MIN_SIDE_PX} x "
@@ -155,16 +151,14 @@ def _open(
 
 
 @contextmanager
-def open_picture(
-    content: bytes, formats: tuple[str, ...], name: str, remedy: str, budget: Budget
-) -> Iterator[Image.Image]:
+def open_picture(content: bytes, kinds: list[str], name: str, remedy: str, budget: Budget) -> Iterator[Image.Image]:
     """Open a picture within the limit of pixels; errors in the block are those of a damaged file."""
     limit = budget.limits.max_plan_pixels
     many = f"the limit is {limit} in total (max_plan_pixels); reduce its resolution, or crop it"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=formats) as picture:
+            with Image.open(io.BytesIO(content), formats=kinds) as picture:
                 if picture.width * picture.height > limit:
                     raise InvalidFloorPlanError(f"{name} has {picture.width} x {picture.height} pixels; {many}")
                 yield picture
@@ -190,14 +184,14 @@ def _is_light(picture: Image.Image) -> bool:
     return float(np.quantile(np.asarray(picture.convert("L"))[alpha >= _CLEAR], _LEAST_DARK)) > _LIGHT
 
 
-def _has_dark_ground(gray: UInt8[np.ndarray, "h w"]) -> bool:
+def _has_dark_ground(gray: Gray) -> bool:
     """Return whether the most frequent tone is dark, and most of the picture has about this tone."""
     share = np.bincount(gray.ravel() >> 4, minlength=16) / gray.size
     ground = int(share.argmax())
     return ground < _DARK_TONES and float(share[max(ground - 1, 0) : ground + 2].sum()) > _MOSTLY
 
 
-def _warmth(picture: Image.Image) -> UInt8[np.ndarray, "h w"]:
+def _warmth(picture: Image.Image) -> Gray:
     """Return half of red minus blue, plus 128 (see `Ink.warmth`)."""
     red, blue = (np.asarray(picture.getchannel(name)) for name in "RB")
     # Computed in bytes: wider types take hundreds of megabytes for the largest pictures.

@@ -20,7 +20,7 @@ from lalaloc_core.floorplan.json_values import is_number
 from lalaloc_core.floorplan.plan_words import fixture_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
-from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import MAX_COORDINATE, check_coordinates, point_xy, polygons_of
 from lalaloc_core.importers.common.sketch import OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import enclose
 
@@ -136,7 +136,7 @@ def _floor(raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
 
 def _outlines(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> list[shapely.Polygon]:
     """Return a surface with these corners, seen from above."""
-    return polygons_from_geometry(shapely.Polygon(_from_above(_place(local, raw, where))))
+    return polygons_of(shapely.Polygon(_from_above(_place(local, raw, where))))
 
 
 def _place(local: Float[np.ndarray, "n 3"], raw: Mapping[str, Any], where: str) -> Float[np.ndarray, "n 3"]:

@@ -21,6 +21,7 @@ from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.common.bounded_files import pack
 from lalaloc_core.importers.common.geometry import MapFrame
 from lalaloc_core.importers.common.import_limits import DEFAULT_IMPORT_LIMITS, Budget
+from lalaloc_core.importers.common.import_options import to_number
 
 if TYPE_CHECKING:
     from lalaloc_core.importers.picture.occupancy import OccupancyGrid
@@ -164,7 +165,7 @@ def _classify(gray: UInt8[np.ndarray, "h w"], settings: Mapping[str, Any]) -> Oc
 
     resolution_m = _number(settings, "resolution", None, _RESOLUTION_M)
     origin = settings.get("origin")
-    place = [_to_float(value) for value in origin] if isinstance(origin, list) else []
+    place = [to_number(value) for value in origin] if isinstance(origin, list) else []
     if len(place) < 2 or not all(abs(value) < _MAX_ORIGIN_M for value in place):
         raise InvalidFloorPlanError(
             f"origin of the ROS map is {str(origin)[:50]}; it must be [x, y, yaw], numbers below {_MAX_ORIGIN_M:g}"
@@ -186,7 +187,7 @@ def _gray(content: bytes, budget: Budget) -> UInt8[np.ndarray, "h w"]:
 
     from lalaloc_core.importers.formats.picture import in_bytes, open_picture
 
-    with open_picture(content, ("PPM", "PNG"), "the picture of the ROS map", "save it again", budget) as picture:
+    with open_picture(content, ["PPM", "PNG"], "the picture of the ROS map", "save it again", budget) as picture:
         # Transparent cells are unknown.
         flat = Image.new("RGBA", picture.size, (_UNKNOWN, _UNKNOWN, _UNKNOWN, 255))
         flat.alpha_composite(in_bytes(picture).convert("RGBA"))
@@ -243,15 +244,7 @@ def _text(settings: Mapping[str, Any], key: str) -> str:
 
 def _number(settings: Mapping[str, Any], key: str, default: float | None, limits: tuple[float, float]) -> float:
     raw, (low, high) = settings.get(key, default), limits
-    value = _to_float(raw)
+    value = to_number(raw)
     if not low <= value <= high:
         raise InvalidFloorPlanError(f"{key} of the ROS map is {str(raw)[:50]}; it must be {low:g} to {high:g}")
     return value
-
-
-def _to_float(value: object) -> float:
-    """Return the number in a text of the YAML, NaN if there is none; float() accepts 1_000, which YAML does not."""
-    try:
-        return math.nan if "_" in str(value) else float(str(value))
-    except ValueError:
-        return math.nan

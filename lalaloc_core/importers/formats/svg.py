@@ -23,22 +23,14 @@ from lalaloc_core.floorplan.plan_words import Role, fixture_from_name, role_from
 from lalaloc_core.importers.common import Budget, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import in_range, label_position, polygons_of
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.drawing.drawing_scale import drawing_scale
 from lalaloc_core.importers.drawing.scale_guess import assume_scale
 from lalaloc_core.importers.drawing.sketch_drawing import guess_drawing
 from lalaloc_core.importers.drawing.storeys import by_storey
-from lalaloc_core.importers.drawing.vector_drawing import (
-    CURVE_STEPS,
-    Area,
-    Drawing,
-    Lettering,
-    Paint,
-    Stroke,
-    Subpath,
-    leaves_of,
-)
+from lalaloc_core.importers.drawing.vector_drawing import Area, Drawing, Lettering, Paint, Stroke, Subpath, leaves_of
 from lalaloc_core.importers.formats.svg_limits import HREF, check_work
 
 # Attribute of the root element with the scale of exported drawings.
@@ -49,9 +41,7 @@ _GROUPS = (svgelements.Group, svgelements.Use)
 _COMBINED = re.compile(r"(?:^|,)\s*([^\s@,][^,]*[\s>+~\[:][^\s,][^,]*)")
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
 # Names that editors generate.
-_AUTOMATIC = re.compile(
-    r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
-)
+_MADE = re.compile(r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I)
 # A character in an id of Illustrator.
 _ESCAPED = re.compile(r"_x([0-9A-F]{2,4})_")
 _NONZERO = (None, "nonzero")
@@ -103,7 +93,7 @@ def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[Import
     root = read_xml(content, budget)
     if local_name(root) != "svg":
         raise InvalidFloorPlanError(f"the root element is <{local_name(root)[:50]}>; it must be <svg>")
-    pictures = sum(local_name(element) == "image" for element in root.iter())
+    pictures = sum(local_name(element) in ("image", "img") for element in root.iter())
     hypertexts = (element for element in root.iter() if local_name(element) == "foreignObject")
     texts = sum(any(text.strip() for text in element.itertext()) for element in hypertexts)
     for parent in list(root.iter()):
@@ -219,7 +209,7 @@ def _read_plan(root: Element, warnings: list[str], options: ImportOptions, budge
     )
     if options.y_axis != "up":
         builder.notes.append("y points down in SVG and was flipped")
-    return by_storey(drawing, builder, options, budget, flip_y=options.y_axis != "up")
+    return by_storey({0.0: drawing}, builder, options, budget, flip_y=options.y_axis != "up")
 
 
 def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
@@ -273,10 +263,7 @@ def _size_on_paper(root: Element) -> tuple[float | None, float | None]:
 
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
-    try:
-        value = float(root.get(_SCALE_ATTRIBUTE, ""))
-    except ValueError:
-        return None
+    value = to_number(root.get(_SCALE_ATTRIBUTE))
     return (value, _SCALE_ATTRIBUTE) if 1e-6 <= value <= 1e3 else None
 
 
@@ -359,7 +346,7 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         elif pen is not None and not pen.is_visible and not closed and role is None:
             builder.use(layer, "ignored (invisible)")
         elif len(points) >= 4 and (closed or (role in ("room", "wall", "obstacle") and is_filled)):
-            shells += polygons_from_geometry(shapely.Polygon(points))
+            shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and (line := shapely.LineString(points)).length > 0.0:
             is_white = pen is not None and pen.is_white
             drawing.strokes.append(Stroke(line, layer, role, width, drawing.next_order, is_white))
@@ -367,10 +354,8 @@ def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: Repor
         elif not len(points):
             builder.use(layer, "ignored (coordinates out of range)")
     if shells:
-        is_wall, is_nonzero = (
-            fill is not None and is_filled and fill.is_dark,
-            element.values.get("fill-rule") in _NONZERO,
-        )
+        is_wall = fill is not None and is_filled and fill.is_dark
+        is_nonzero = element.values.get("fill-rule") in _NONZERO
         like = Area(shells[0], layer, role, _name_of(element, context), context.kind, is_wall, width)
         count = drawing.add_areas(shells, like, fill, is_nonzero=is_filled and is_nonzero, has_line=True)
         builder.use(layer, f"areas: {role or 'possible rooms'}", count)
@@ -395,7 +380,7 @@ def _outlines(shape: svgelements.Shape, budget: Budget) -> Iterator[tuple[np.nda
             if isinstance(segment, svgelements.Move) or segment.start is None or segment.end is None:
                 continue
             is_curved = not isinstance(segment, svgelements.Line | svgelements.Close)
-            steps = CURVE_STEPS if is_curved else 1
+            steps = Subpath.STEPS if is_curved else 1
             budget.spend(steps)
             path.add([(*segment.point(k / steps),) for k in range(steps + 1)], is_curved=is_curved)
         points = np.array(path.points, dtype=float).reshape(-1, 2)
@@ -412,7 +397,7 @@ def _name_of(element: Any, context: _Context) -> str | None:
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
         text = _ESCAPED.sub(lambda found: chr(int(found[1], 16)), str(own.get(key) or "")).strip()
-        if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_from_name(text) is None):
+        if text and not _MADE.fullmatch(text) and (key != "id" or role_from_name(text) is None):
             return text.replace("_", " ")
     if context.role != "room" or context.kind is None:
         return None

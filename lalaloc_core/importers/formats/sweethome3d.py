@@ -22,7 +22,8 @@ from lalaloc_core.floorplan.plan_words import fixture_from_name, role_from_name
 from lalaloc_core.importers.common import Budget, ImportOptions, Level, ReportBuilder, Sketch, SketchedRoom
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, assemble_levels
 from lalaloc_core.importers.common.bounded_files import local_name, read_xml
-from lalaloc_core.importers.common.geometry import point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import point_xy, polygons_of
+from lalaloc_core.importers.common.import_options import to_number
 from lalaloc_core.importers.common.sketch import ROOM_HEIGHT_M, OpeningKind, SketchedFixture, SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, enclose
 
@@ -57,9 +58,7 @@ def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> 
         raise InvalidFloorPlanError(f"the root element of {_MEMBER} is <{local_name(root)[:50]}>; it must be <home>")
     storeys = _storeys(root)
     if not storeys:
-        raise InvalidFloorPlanError(
-            "the home has no walls and no rooms; draw them in Sweet Home 3D, or export the plan"
-        )
+        raise InvalidFloorPlanError("the home has no walls and no rooms; draw them in Sweet Home 3D or export the plan")
     compass = next((element for element in root if local_name(element) == "compass"), None)
     north_deg = None if compass is None else math.degrees(_number(compass, "northDirection", 0.0))
 
@@ -104,7 +103,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
         outline = _CM * np.array([(_number(p, "x"), -_number(p, "y")) for p in room if local_name(p) == "point"])
         budget.spend(len(outline))
         has_area = len(outline) >= 3 and np.isfinite(outline).all()
-        parts = polygons_from_geometry(shapely.Polygon(outline)) if has_area else []
+        parts = polygons_of(shapely.Polygon(outline)) if has_area else []
         builder.use("room", "rooms" if parts else "ignored (no area)")
         drawn += [(part, room.get("name") or None) for part in parts]
     height_m = storey.height_m if ROOM_HEIGHT_M[0] <= storey.height_m <= ROOM_HEIGHT_M[1] else None
@@ -116,7 +115,7 @@ def _add_rooms(storey: _Storey, sketch: Sketch, builder: ReportBuilder, budget: 
     taken = shapely.union_all([room.shape for room in sketch.rooms])
     for part, name in drawn:
         if shapely.intersection(part, taken).area <= _SAME * part.area:
-            free = polygons_from_geometry(part.difference(walls))
+            free = polygons_of(part.difference(walls))
             sketch.rooms += [SketchedRoom(free_part, name, (), height_m) for free_part in free]
     sketch.openings += [SketchedOpening("passage", gap.start, gap.end) for gap in enclosed.gaps]
 
@@ -134,7 +133,7 @@ def _wall(wall: Element, builder: ReportBuilder, budget: Budget) -> list[shapely
         return []
     builder.use("wall", "walls")
     body = shapely.LineString(points).buffer(0.5 * thickness_m, cap_style="square", join_style="mitre")
-    return polygons_from_geometry(body)
+    return polygons_of(body)
 
 
 def _arc(start: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"], angle: float) -> Float[np.ndarray, "n 2"]:
@@ -188,8 +187,5 @@ def _box(piece: Element) -> shapely.Polygon | None:
 
 def _number(element: Element, key: str, default: float = math.nan) -> float:
     """Return an attribute as a number, or the default if it is missing or none."""
-    try:
-        value = float(element.get(key) or default)
-    except ValueError:
-        return default
+    value = to_number(element.get(key))
     return value if math.isfinite(value) else default

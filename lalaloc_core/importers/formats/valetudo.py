@@ -19,7 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_values import is_number, read_json
 from lalaloc_core.importers.common import Budget, ImportLimits, ImportOptions, ReportBuilder
 from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.common.geometry import check_coordinates, check_overlaps, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import check_coordinates, check_overlaps, point_xy, polygons_of
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 
 _CELL_CM = (1.0, 20.0)
@@ -68,10 +68,10 @@ def read(document: Mapping[str, Any], options: ImportOptions, budget: Budget) ->
         elif shape is not None:
             facts = layer.get("metaData")
             name = facts.get("name") if isinstance(facts, Mapping) else None
-            parts = [part for part in polygons_from_geometry(shape) if part.area >= _LEAST_M2]
+            parts = [part for part in polygons_of(shape) if part.area >= _LEAST_M2]
             floors = [shapely.Polygon(part.exterior) for part in parts]
             outlines += floors
-            simple = [part for floor in floors for part in polygons_from_geometry(floor.simplify(cell_m))]
+            simple = [part for floor in floors for part in polygons_of(floor.simplify(cell_m))]
             sketch.rooms += [SketchedRoom(part, str(name)[:200] if name else None) for part in simple]
     if not sketch.rooms:
         raise InvalidFloorPlanError("the map has no segments: let the robot divide it into rooms, and send it again")

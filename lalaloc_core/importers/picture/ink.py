@@ -35,6 +35,10 @@ _THRESHOLD = (95.0, 205.0)
 # picture, and of pixels with the tone of their neighbours.
 _NETWORK_PX, _LEAST_COLOUR, _ALIKE, _SLENDER, _FLOORS, _FLAT, _SAME_TONE = 500, 0.04, 20.0, 200.0, 0.05, 0.6, 4
 
+# Pictures: tones, colours, and pixels by whether they are of a kind or by the number of their part.
+Gray, Colours = UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w 3"]
+Mask, Labels = Bool[np.ndarray, "h w"], Int[np.ndarray, "h w"]
+
 
 @dataclass(frozen=True, eq=False)
 class Ink:
@@ -48,10 +52,10 @@ class Ink:
         size: rows and columns of the picture before the rotation, at this resolution.
     """
 
-    gray: UInt8[np.ndarray, "h w"]
-    warmth: UInt8[np.ndarray, "h w"] | None
-    mask: Bool[np.ndarray, "h w"]
-    lines: Bool[np.ndarray, "h w"]
+    gray: Gray
+    warmth: Gray | None
+    mask: Mask
+    lines: Mask
     metres_per_pixel: float
     skew_deg: float
     size: tuple[int, int]
@@ -72,13 +76,7 @@ class Ink:
         return np.column_stack([x, self.size[0] - y]) + self._margin
 
 
-def read_ink(
-    gray: UInt8[np.ndarray, "h w"],
-    metres_per_pixel: float,
-    warmth: UInt8[np.ndarray, "h w"] | None = None,
-    *,
-    straighten: bool = True,
-) -> Ink:
+def read_ink(gray: Gray, metres_per_pixel: float, warmth: Gray | None = None, *, straighten: bool = True) -> Ink:
     """Even out the lighting, straighten the picture unless told not to, and threshold it.
 
     Rows of `gray` are from the top, and 255 is white; for `warmth` see `Ink`.
@@ -106,9 +104,7 @@ def read_ink(
     return Ink(even, warmth, mask, lines, metres_per_pixel, skew_deg, gray.shape)
 
 
-def blank_outside(
-    picture: UInt8[np.ndarray, "h w"], box: tuple[float, float, float, float]
-) -> UInt8[np.ndarray, "h w"]:
+def blank_outside(picture: Gray, box: tuple[float, float, float, float]) -> Gray:
     """Return a picture that is paper outside a box: left, top, right and bottom in pixels. Coordinates stay."""
     rows, columns = picture.shape
     x0, y0, x1, y1 = (round(number) for number in box)
@@ -124,7 +120,7 @@ def blank_outside(
     return blank
 
 
-def darken_pale_walls(colours: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"] | None:
+def darken_pale_walls(colours: Colours) -> Gray | None:
     """Return a grey picture with dark walls on white floors if walls are paler than floors, else None.
 
     Walls are the darkest of the long, thin areas of one colour in a drawing; floors are thick areas of one tone.
@@ -160,12 +156,12 @@ def darken_pale_walls(colours: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, 
     return np.where(walls > 0, 0, flat).astype(np.uint8)
 
 
-def _of_tone(colours: UInt8[np.ndarray, "h w 3"], tone: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "h w"]:
+def _of_tone(colours: Colours, tone: Float[np.ndarray, "3"]) -> Gray:
     """Return 1 where a picture has about a colour, else 0."""
     return np.asarray(cv2.inRange(colours, tone - _ALIKE, tone + _ALIKE), np.uint8) & np.uint8(1)
 
 
-def drawn_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
+def drawn_extent(gray: Gray) -> float:
     """Return the longer side (pixels) of the largest drawing in a picture, without titles and small print beside it."""
     ink = gray < min(float(np.median(gray)) - _FAINTEST, _THRESHOLD[1])
     boxes = boxes_of_parts(ink)
@@ -177,15 +173,13 @@ def drawn_extent(gray: UInt8[np.ndarray, "h w"]) -> float:
     return float(max(boxes_of_parts(drawn)[:, 2:].max(initial=0) - 2 * near, longest) or max(gray.shape))
 
 
-def boxes_of_parts(mask: Bool[np.ndarray, "h w"] | UInt8[np.ndarray, "h w"]) -> Int[np.ndarray, "n 4"]:
+def boxes_of_parts(mask: Mask | Gray) -> Int[np.ndarray, "n 4"]:
     """Return the left column, top row, width and height of connected parts."""
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
     return stats[1:, :4]
 
 
-def faint_lines(
-    even: UInt8[np.ndarray, "h w"], metres_per_pixel: float, faintest: float = _FAINTEST
-) -> Bool[np.ndarray, "h w"]:
+def faint_lines(even: Gray, metres_per_pixel: float, faintest: float = _FAINTEST) -> Mask:
     """Return thin lines that are darker than their surroundings, at least by `faintest` and by the paper's noise."""
     soft = cv2.GaussianBlur(even, (0, 0), 0.6)
     noise = 1.48 * float(np.median(np.abs(soft.astype(np.int16) - cv2.medianBlur(soft, 5))))
@@ -194,7 +188,7 @@ def faint_lines(
     return depth > max(faintest, _OVER_NOISE * noise)
 
 
-def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt8[np.ndarray, "h w"]:
+def _even_light(gray: Gray, metres_per_pixel: float) -> Gray:
     """Divide the picture by the brightness of its paper, the smoothed local maximum."""
     size = max(3, round(_LIGHT_M / metres_per_pixel)) | 1
     coarse = 8
@@ -206,9 +200,7 @@ def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt
     return np.clip(even, 0, 255).astype(np.uint8)
 
 
-def _blank_floors(
-    gray: UInt8[np.ndarray, "h w"], even: UInt8[np.ndarray, "h w"], metres_per_pixel: float
-) -> UInt8[np.ndarray, "h w"]:
+def _blank_floors(gray: Gray, even: Gray, metres_per_pixel: float) -> Gray:
     """Return an even picture with white floors: areas of the grey picture wider than walls, and paler than most."""
     around = np.ones((round(_WIDER_M / metres_per_pixel) | 1,) * 2, np.uint8)
     paper, threshold = cv2.morphologyEx(gray, cv2.MORPH_CLOSE, around), _threshold(even)
@@ -219,12 +211,12 @@ def _blank_floors(
     return np.where(is_floor, cv2.divide(gray, paper, scale=255.0), even).astype(np.uint8)
 
 
-def _threshold(even: UInt8[np.ndarray, "h w"]) -> float:
+def _threshold(even: Gray) -> float:
     threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
     return float(np.clip(threshold, *_THRESHOLD))
 
 
-def find_skew(ink: Bool[np.ndarray, "h w"], reach_deg: float = _MAX_SKEW_DEG) -> float:
+def find_skew(ink: Mask, reach_deg: float = _MAX_SKEW_DEG) -> float:
     """Return the rotation (degrees) that aligns most lines of a drawing with rows and columns, up to `reach_deg`.
 
     It maximises the energy of the differences between neighbouring row sums and column sums.

@@ -24,7 +24,7 @@ from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import point_xy
 from lalaloc_core.importers.drawing.enclosed_rooms import without_overlaps
 from lalaloc_core.importers.drawing.vector_drawing import Drawing, Lettering, Stroke
-from lalaloc_core.importers.picture.ink import Ink, boxes_of_parts, read_ink
+from lalaloc_core.importers.picture.ink import Gray, Ink, boxes_of_parts, read_ink
 
 # Side (pixels) of a tile, which takes about 0.8 GB of address space, and longer side of the picture that is read.
 _TILE_PX, _OVERLAP_PX = 1280, 256
@@ -79,9 +79,7 @@ class PictureTexts:
         return [replace(text, position=point_xy(text.position + corner)) for text in texts]
 
 
-def read_texts(
-    gray: UInt8[np.ndarray, "h w"], builder: ReportBuilder, budget: Budget, *, straighten: bool = True
-) -> PictureTexts:
+def read_texts(gray: Gray, builder: ReportBuilder, budget: Budget, *, straighten: bool = True) -> PictureTexts:
     """Return the texts of a picture whose rows are from the top; none if the extra `ocr` is not installed.
 
     The picture is straightened by the skew of its lines unless told not to.
@@ -124,7 +122,7 @@ def read_texts(
     return found
 
 
-def _resized_ink(gray: UInt8[np.ndarray, "h w"], longest_px: int, *, straighten: bool) -> tuple[float, Ink]:
+def _resized_ink(gray: Gray, longest_px: int, *, straighten: bool) -> tuple[float, Ink]:
     """Return the factor between a picture and its ink, whose longer side is at most `longest_px`."""
     rows, columns = gray.shape
     factor = float(np.clip(max(rows, columns), _SMALLEST_PX, longest_px)) / max(rows, columns)
@@ -283,7 +281,7 @@ def _thin_lines(ink: Ink, texts: Sequence[Corners]) -> list[shapely.LineString]:
     return lines + [mark for index, mark in enumerate(marks) if index not in along]
 
 
-def _runs(mask: UInt8[np.ndarray, "h w"]) -> list[_Run]:
+def _runs(mask: Gray) -> list[_Run]:
     """Return the longest thin horizontal lines."""
     shortest, widest = (round(share * max(mask.shape)) for share in (_SHORTEST, _WIDEST))
     opened = cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((1, shortest), np.uint8))
@@ -309,7 +307,7 @@ def _join_runs(runs: Sequence[_Run], texts: Sequence[Float[np.ndarray, "4"]]) ->
     return runs
 
 
-def _marks(mask: UInt8[np.ndarray, "h w"], x0: float, x1: float, top: int, height: int) -> list[float]:
+def _marks(mask: Gray, x0: float, x1: float, top: int, height: int) -> list[float]:
     """Return the columns where ink crosses a horizontal line: ticks, slashes and lines on both sides of it."""
     rows = top - _MARK_PX, top + height + _MARK_PX - 1
     if rows[0] < 0 or rows[1] >= mask.shape[0]:

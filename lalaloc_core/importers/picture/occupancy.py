@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float
 
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_from_geometry
+from lalaloc_core.importers.common.geometry import MapFrame, point_xy, polygons_of
 from lalaloc_core.importers.common.sketch import Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import explained_size
-from lalaloc_core.importers.picture.ink import find_skew, rotate_picture
+from lalaloc_core.importers.picture.ink import Colours, Gray, Labels, Mask, find_skew, rotate_picture
 from lalaloc_core.importers.picture.sketch_picture import sketch_picture
 from lalaloc_core.importers.picture.wall_mask import usual_thickness
 
@@ -44,7 +44,7 @@ _OUTER_M, _DOOR_M, _GROWN_M = 0.1, 1.3, 0.036
 # Tones: number, least shares of the picture, of its edge (ground) and of a floor; tolerances (of 255) of equal tones,
 # of pixels of a tone, and of walls.
 _TONES, _LEAST, _GROUND, _EVEN, _SAME, _OF_TONE, _OF_WALL = 24, 0.001, 0.05, 0.6, 10.0, 24.0, 40.0
-# Blur of edges and thinnest walls (cells), thickest inner and outer walls of maps (m), thickness of paths relative to
+# Blur of edges and thinnest walls (cells), thickest thin and other walls of maps (m), thickness of paths relative to
 # walls, least share of floors, smallest floor and largest zone inside one (m²), and share of its rim without a wall.
 _BLURRED, _WALL_CELLS, _THICKEST_M, _THINNER = 2.0, 1.5, (0.065, 0.12), 0.35
 _FLOORS, _FLOOR_M2, _ZONE_M2, _OPEN = 0.6, 1.0, 6.0, 0.5
@@ -55,13 +55,11 @@ class OccupancyGrid:
     """Grid with its occupied and free cells; all others are unknown."""
 
     frame: MapFrame
-    occupied: Bool[np.ndarray, "h w"]
-    free: Bool[np.ndarray, "h w"]
+    occupied: Mask
+    free: Mask
 
 
-def sketch_map(
-    colours: UInt8[np.ndarray, "h w 3"], metres_per_pixel: float, builder: ReportBuilder, budget: Budget
-) -> Sketch | None:
+def sketch_map(colours: Colours, metres_per_pixel: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:
     """Return the rooms and passages of a map as apps of robots show it; None if the picture is none.
 
     Rooms are areas of flat colours that touch or have thin lines between them, below paths, names and symbols.
@@ -85,7 +83,7 @@ def sketch_map(
     ground = (label >= 0) & (label < first)
     ground &= _near(~_near(~ground, _OUTER_M / cell_m), _OUTER_M / cell_m)
     label = np.where(label >= first, label, 0)
-    walls = _without_specks(_lines_around(ground, label > 0, small, tones, cell_m), frame) > 0
+    walls = _without_specks(_lines_at(ground, label > 0, small, tones, cell_m), frame) > 0
     areas, zones_m2 = _areas(label, walls, cell_m, budget)
     free = areas > 0
     between = _closed(free, _GAP_M / cell_m) & ~free
@@ -94,7 +92,9 @@ def sketch_map(
     within = np.asarray(found)
     outer = np.concatenate([within[0], within[-1], within[:, 0], within[:, -1]])
     inside = ~(ground & np.isin(within, outer))
-    is_map = thick_m[0] <= _THICKEST_M[0] and thick_m[1] <= _THICKEST_M[1] and float(free[inside].mean()) >= _FLOORS
+    # Beside thin outer walls, a wall between two rooms can have a line of each.
+    is_thin = thick_m[0] <= _THICKEST_M[0] or 0.0 < thick_m[1] <= _THICKEST_M[0]
+    is_map = is_thin and max(thick_m) <= _THICKEST_M[1] and float(free[inside].mean()) >= _FLOORS
     if not is_map or not (walls.any() or len(np.unique(areas)) > 2):
         return None
     if zones_m2:
@@ -135,11 +135,11 @@ def sketch_map(
     return sketch
 
 
-def _near(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+def _near(mask: Mask, reach: float) -> Mask:
     return np.asarray(cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)) <= reach
 
 
-def _closed(mask: Bool[np.ndarray, "h w"], reach: float) -> Bool[np.ndarray, "h w"]:
+def _closed(mask: Mask, reach: float) -> Mask:
     rim = math.ceil(reach) + 1
     return ~_near(~_near(np.pad(mask, rim), reach), reach)[rim:-rim, rim:-rim]
 
@@ -158,19 +158,13 @@ def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h
     return np.array([np.abs(colours.astype(np.float32) - tone).max(axis=2) for tone in tones])
 
 
-def _is_floor(mask: Bool[np.ndarray, "h w"], cell_m: float) -> bool:
+def _is_floor(mask: Mask, cell_m: float) -> bool:
     """Return whether an area is wide somewhere, apart from lines over it."""
     inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
     return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
 
 
-def _lines_around(
-    ground: Bool[np.ndarray, "h w"],
-    floor: Bool[np.ndarray, "h w"],
-    colours: np.ndarray,
-    tones: Float[np.ndarray, "n 3"],
-    cell_m: float,
-) -> Bool[np.ndarray, "h w"]:
+def _lines_at(ground: Mask, floor: Mask, colours: np.ndarray, tones: Float[np.ndarray, "n 3"], cell_m: float) -> Mask:
     """Return all lines of the tone that most lines between ground and floors have; none if blends are between them."""
     far = _distances(colours, tones).min(axis=0)
     beside = _near(ground, max(1.5, 0.8 * _OUTER_M / cell_m)) & ~ground & _near(floor, 1.5 * _OUTER_M / cell_m)
@@ -187,9 +181,7 @@ def _lines_around(
     return cv2.morphologyEx(walls, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
-def _areas(
-    label: np.ndarray, walls: Bool[np.ndarray, "h w"], cell_m: float, budget: Budget
-) -> tuple[Int[np.ndarray, "h w"], list[float]]:
+def _areas(label: np.ndarray, walls: Mask, cell_m: float, budget: Budget) -> tuple[Labels, list[float]]:
     """Return the number of each cell's room, 0 without, and the sizes (m²) of zones and carpets inside rooms."""
     areas, zones_m2 = np.zeros(label.shape, np.int32), list[float]()
     for tone in np.unique(label[label > 0]):
@@ -256,16 +248,14 @@ def sketch_grid(grid: OccupancyGrid, builder: ReportBuilder, budget: Budget) -> 
     builder.no_room = report.no_room
     if builder.no_room:
         area_m2 = sum(area.area for area in builder.no_room)
-        builder.warnings.append(
-            f"{area_m2:.0f} m² inside the walls became no room (no_room); close the walls in the picture"
-        )
+        builder.warnings.append(f"{area_m2:.0f} m² inside walls became no room (no_room); close them in the picture")
     _report_free_cells(sketch, grid, builder)
     if sketch.openings:
         builder.unsure.append(f"{len(sketch.openings)} gaps in walls are taken for passages or doors")
     return sketch
 
 
-def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Budget) -> tuple[Sketch, ReportBuilder]:
+def _read_walls(cells: Gray, grid: OccupancyGrid, budget: Budget) -> tuple[Sketch, ReportBuilder]:
     """Return what the picture importer finds between walls (1), in the map frame."""
     frame = grid.frame
     rows, columns = frame.size
@@ -299,7 +289,7 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
     inner.no_room = [shapely.transform(area, to_map) for area in inner.no_room]
     rooms = []
     for room in sketch.rooms:
-        for part in polygons_from_geometry(room.shape.buffer(grown * fine_m, join_style="mitre")):
+        for part in polygons_of(room.shape.buffer(grown * fine_m, join_style="mitre")):
             floor = shapely.transform(part, to_grid)
             if _free_share(floor, grid) >= _FREE_SHARE:
                 rooms.append(SketchedRoom(shapely.transform(floor, frame.to_map)))
@@ -310,9 +300,7 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
 
 
-def _furniture(
-    cells: UInt8[np.ndarray, "h w"], frame: MapFrame
-) -> tuple[UInt8[np.ndarray, "h w"], list[tuple[float, float]]]:
+def _furniture(cells: Gray, frame: MapFrame) -> tuple[Gray, list[tuple[float, float]]]:
     """Return the groups of cells (1) of the size of furniture that touch no wall, and their middles in the map frame.
 
     Thinner ones are free-standing walls.
@@ -333,7 +321,7 @@ def _furniture(
     return found, places
 
 
-def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> list[float]:
+def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Mask) -> list[float]:
     """Return the share of each room's outline (map frame) that has a wall beside it that was seen."""
     cell_m, shares = grid.frame.resolution_m, []
     distance_m = np.asarray(cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)) * cell_m
@@ -356,7 +344,7 @@ def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuild
         )
 
 
-def _without_specks(cells: Bool[np.ndarray, "h w"], frame: MapFrame) -> UInt8[np.ndarray, "h w"]:
+def _without_specks(cells: Mask, frame: MapFrame) -> Gray:
     """Return cells, as 1, without those that are too few for a wall."""
     _, found, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=8)
     longest = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)

@@ -10,17 +10,16 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import UInt8
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
-from lalaloc_core.importers.common.geometry import polygons_from_geometry
+from lalaloc_core.importers.common.geometry import polygons_of
 from lalaloc_core.importers.common.room_bounds import WallConfig
 from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
 from lalaloc_core.importers.drawing.sketch_drawing import is_between_rooms, split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
-from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
+from lalaloc_core.importers.picture.ink import FINEST_M, Gray, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
 from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
@@ -98,11 +97,11 @@ class _Reading:
 
 
 def sketch_picture(
-    gray: UInt8[np.ndarray, "h w"],
+    gray: Gray,
     metres_per_pixel: float,
     builder: ReportBuilder,
     budget: Budget,
-    warmth: UInt8[np.ndarray, "h w"] | None = None,
+    warmth: Gray | None = None,
     *,
     straighten: bool = True,
     has_symbols: bool = True,
@@ -247,9 +246,7 @@ def _fixtures(
         and not any(other.holds(shape) for other in large)
     ]
     if unused:
-        builder.notes.append(
-            f"{len(unused)} drawn shapes inside rooms are no clear symbols of fixtures and were not used"
-        )
+        builder.notes.append(f"{len(unused)} drawn shapes in rooms are no clear symbols of fixtures and were not used")
     return found
 
 
@@ -274,6 +271,7 @@ def _openings(
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
+            builder.places[builder.unsure[-1]] = shapely.Point(start)
     return found
 
 
@@ -317,11 +315,11 @@ def _report_coverage(reading: _Reading, builder: ReportBuilder) -> None:
     """Report the share of the drawn area that became rooms, and the parts that did not."""
     walls = shapely.union_all([reading.enclosed.walls, *(gap.shape for gap in reading.enclosed.gaps)])
     closed = walls.buffer(_CLOSING_M, join_style="mitre")
-    drawn = shapely.union_all([shapely.Polygon(part.exterior) for part in polygons_from_geometry(closed)])
+    drawn = shapely.union_all([shapely.Polygon(part.exterior) for part in polygons_of(closed)])
     inside = drawn.buffer(-_CLOSING_M, join_style="mitre").difference(walls)
     rooms = shapely.union_all(reading.enclosed.rooms)
     half_m = 0.5 * reading.walls.thickness_m + _CLEARANCE_M
-    missing = polygons_from_geometry(inside.difference(rooms).buffer(-half_m).buffer(half_m))
+    missing = polygons_of(inside.difference(rooms).buffer(-half_m).buffer(half_m))
     lost = sorted((part for part in missing if part.area >= _MIN_ROOM_M2), key=lambda part: -part.area)
     if inside.area <= 0.0:
         return

@@ -9,7 +9,7 @@ a box with pillows at its head, which is at a wall. Stairs are treads of one siz
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -18,6 +18,7 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.sketch import SketchedFixture
 from lalaloc_core.importers.picture.ink import Ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape
@@ -52,7 +53,7 @@ class Symbol:
         return inside and (self.back is None or bool(shapely.distance(self.back, room.exterior) <= _AT_WALL_M))
 
 
-def find_symbols(strict: Sequence[Shape], faint: Sequence[Shape], check_time: Callable[[], None]) -> list[Symbol]:
+def find_symbols(strict: Sequence[Shape], faint: Sequence[Shape], check_time: CheckTime) -> list[Symbol]:
     """Return the clear symbols among the closed shapes of a picture, read without and with faint lines.
 
     `check_time` is called between steps and raises an exception to stop.
@@ -61,7 +62,7 @@ def find_symbols(strict: Sequence[Shape], faint: Sequence[Shape], check_time: Ca
     return _symbols(faint, clear, check_time)
 
 
-def _symbols(shapes: Sequence[Shape], given: Sequence[Symbol], check_time: Callable[[], None]) -> list[Symbol]:
+def _symbols(shapes: Sequence[Shape], given: Sequence[Symbol], check_time: CheckTime) -> list[Symbol]:
     """Return the symbols that are given, and others among shapes."""
     tree = shapely.STRtree([shape.outline for shape in shapes])
     found = list(given)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
-from lalaloc_core.importers.picture.ink import Ink
+from lalaloc_core.importers.common.geometry import cross, polygons_of
+from lalaloc_core.importers.common.import_limits import CheckTime
+from lalaloc_core.importers.picture.ink import Ink, Labels, Mask
 
 _MIN_THICKNESS_M = 0.055
 # Broadest strokes and leaves between two lines relative to walls, with the thinnest inner wall (m) beside them.
@@ -53,9 +53,9 @@ _ALONG_AXIS_DEG, _ALONG_AXIS_M = 6.0, 0.06
 class WallMask:
     """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls."""
 
-    mask: Bool[np.ndarray, "h w"]
+    mask: Mask
     thickness_m: float
-    cavities: Int[np.ndarray, "h w"] | None
+    cavities: Labels | None
 
 
 def dark_walls(ink: Ink) -> WallMask | None:
@@ -67,7 +67,7 @@ def dark_walls(ink: Ink) -> WallMask | None:
     return _walls(ink, ink.mask & ~strokes, None) if strokes.any() else walls
 
 
-def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
+def _pale_strokes(ink: Ink, walls: WallMask) -> Mask:
     """Return strokes of doors and windows: as broad as thin walls, but paler and thinner than most walls."""
     tone = float(np.median(ink.gray[cv2.erode(walls.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0]))
     pale = (ink.mask & (ink.gray > tone + _PALER)).astype(np.uint8)
@@ -98,9 +98,7 @@ def outlined_walls(ink: Ink) -> WallMask | None:
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
 
 
-def _is_narrow(
-    labels: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], reach: float, count: int
-) -> Bool[np.ndarray, "n"]:
+def _is_narrow(labels: Labels, depth: Float[np.ndarray, "h w"], reach: float, count: int) -> Bool[np.ndarray, "n"]:
     """Return the white areas that are as narrow as a wall nearly everywhere, and only slightly wider elsewhere.
 
     `depth` is the distance from the ink, and `reach` half the width of the widest cavity, both in pixels.
@@ -112,7 +110,7 @@ def _is_narrow(
 
 
 def _is_in_wall(
-    labels: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], is_cavity: Bool[np.ndarray, "n"], ink: Ink
+    labels: Labels, depth: Float[np.ndarray, "h w"], is_cavity: Bool[np.ndarray, "n"], ink: Ink
 ) -> Bool[np.ndarray, "n"]:
     """Return the white areas that lie in walls or between the strokes of a hatch, among those that are narrow enough.
 
@@ -152,7 +150,7 @@ def _is_in_wall(
     return is_sure | (thin & (is_like_wall | ~is_beside)) | is_strip | is_corner
 
 
-def _is_hatched(labels: Int[np.ndarray, "h w"], ink: Ink, count: int) -> Bool[np.ndarray, "n"]:
+def _is_hatched(labels: Labels, ink: Ink, count: int) -> Bool[np.ndarray, "n"]:
     """Return the white areas that the parallel strokes of a hatch bound."""
     around = np.ones((3, 3), np.uint8)
     inked = ink.mask.astype(np.uint8)
@@ -165,14 +163,14 @@ def _is_hatched(labels: Int[np.ndarray, "h w"], ink: Ink, count: int) -> Bool[np
     return found
 
 
-def _reaches(labels: Int[np.ndarray, "h w"], where: Bool[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
+def _reaches(labels: Labels, where: Mask, count: int) -> Bool[np.ndarray, "n"]:
     """Return whether each labelled area has one of some pixels; a maximum per label takes ten times as long."""
     found = np.zeros(count, bool)
     found[labels[where]] = True
     return found
 
 
-def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
+def _walls(ink: Ink, filled: Mask, cavities: Labels | None) -> WallMask | None:
     size = _min_thickness_px(ink)
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     # Strokes of furniture can be broad in scans, and leaves between two lines, but not as broad as walls.
@@ -218,7 +216,7 @@ def usual_thickness(mask: np.ndarray, share: float = 0.5) -> float:
 
 def _without_furniture(
     mask: np.ndarray, thickness: float, metres_per_pixel: float, thickness_range: tuple[float, float]
-) -> Bool[np.ndarray, "h w"]:
+) -> Mask:
     """Drop small pieces that are not as thick as a wall, and discs. Corners between two windows are kept.
 
     `thickness` is the usual thickness of a wall (pixels); `thickness_range` is that of a kept piece, relative to it.
@@ -237,7 +235,7 @@ def _without_furniture(
     return keep[labels]
 
 
-def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[shapely.Polygon]:
+def wall_polygons(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[shapely.Polygon]:
     """Return walls as straightened polygons in plan metres."""
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
@@ -260,8 +258,8 @@ def wall_polygons(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> 
             continue
         shell = shapely.Polygon(ring, holes[index])
         # Contours run through pixel centres, so the wall reaches half a pixel farther.
-        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_from_geometry(shell)]
-        found += [align_edges(part) for shape in grown for part in polygons_from_geometry(shape.simplify(straight))]
+        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
+        found += [align_edges(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
     return found
 
 

@@ -6,19 +6,19 @@ These are lines along the middle, closed at both ends.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from lalaloc_core.importers.common.geometry import opening_line, side_lengths
+from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.sketch import SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
-from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, faint_lines
+from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, Mask, faint_lines
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
 # Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (m), at least a pixel.
@@ -103,7 +103,7 @@ class GapReader:
             return GapContent("line", share, warmth, lines)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
-    def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int]:
+    def _swing(self, gap: Gap, near: Mask, *, is_pale: bool = False) -> tuple[float, int]:
         """Return the drawn share of the best symbol of a door in a gap, and the number of its leaves.
 
         It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
@@ -202,7 +202,7 @@ def _dips(profile: Float[np.ndarray, "n"]) -> list[tuple[int, float]]:
     return found
 
 
-def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[SketchedOpening]:
+def windows_in_walls(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[SketchedOpening]:
     """Return the windows: groups of panes that lie side by side in a wall. `check_time` raises an exception to stop."""
     if walls.cavities is None:
         return []
@@ -225,7 +225,7 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) 
     return found
 
 
-def _panes(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[tuple[np.ndarray, float]]:
+def _panes(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[tuple[np.ndarray, float]]:
     """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
     assert walls.cavities is not None
     # Cavities outside the walls are furniture.
