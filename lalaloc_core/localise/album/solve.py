@@ -249,7 +249,7 @@ def _room_shares(
         alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
-        pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
+        pairs=weights.pairs * pair_odds(photographs, links)[np.ix_(order, order)],
         # Albums of fewer photographs than rooms have no expectation.
         expected=expected if len(photographs) >= rooms else None,
         crowding=weights.crowding,
