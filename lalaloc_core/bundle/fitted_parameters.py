@@ -98,9 +98,9 @@ class AlbumWeights:
 
     misread: float = 0.2
     misfit: float = 0.3
-    pairs: float = 0.25
-    crowding: float = 3.2
-    confidence: tuple[float, float, float] = (1.017, 0.737, -5.441)
+    pairs: float = 0.6
+    crowding: float = 1.6
+    confidence: tuple[float, float, float] = (0.94, 0.69, -7.0)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.misread < 1.0:

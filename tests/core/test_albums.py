@@ -21,9 +21,8 @@ from lalaloc_core.localise.album.entry import (
 )
 from lalaloc_core.localise.album.evidence import AlbumMemory, shared_cameras
 from lalaloc_core.localise.album.ground import AlbumGround
-from lalaloc_core.localise.album.links import pair_odds
 from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, moved_pins
-from lalaloc_core.localise.album.room_assignment import RoomEvidence, assign_rooms
+from lalaloc_core.localise.album.room_assignment import PARTNERS, RoomEvidence, assign_rooms
 from lalaloc_core.localise.album.solve import MAX_ROOMS, calibrated, misread_share, solve_album
 from lalaloc_core.localise.album.solve import _pin as _pin_of
 from lalaloc_core.localise.album.states import States, by_compass, turned_together
@@ -311,14 +310,14 @@ def test_figures_of_pins_count_rooms_and_elsewhere() -> None:
     }  # fmt: skip
 
 
-def test_pairs_of_many_photographs_of_a_room_weigh_no_more_than_those_of_few(
-    photographs: list[AlbumPhotograph],
-) -> None:
-    def weight(count: int) -> float:
-        alike = [photographs[number % 2] for number in range(count)]
-        return float(np.abs(pair_odds(alike, {}, 2, 0.25)).sum(axis=1).max())
-
-    assert weight(120) < 1.3 * weight(6)
+def test_photographs_that_all_look_alike_are_not_drawn_into_one_room() -> None:
+    count = 30
+    alone = np.tile([0.0, 1.0, -9.0], (count, 1))
+    alone[::2] = 1.0, 0.0, -9.0
+    pairs = 0.5 * (1.0 - np.eye(count))
+    evidence = RoomEvidence(alone=alone, walk=None, follows=np.zeros(count, bool), pairs=pairs, expected=None)
+    share = assign_rooms(evidence)
+    assert min(share[::2, 0].mean(), share[1::2, 1].mean()) > 0.6
 
 
 def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
@@ -330,8 +329,9 @@ def _exhaustive(evidence: RoomEvidence) -> np.ndarray:
         log = evidence.alone[np.arange(count), room].sum()
         if evidence.walk is not None:
             log += (evidence.walk[room[:-1], room[1:]] * evidence.follows[1:]).sum()
-        log += 0.5 * (evidence.pairs * (room[:, None] == room) * (room < rooms - 1)).sum()
         counts = np.bincount(room, minlength=rooms)
+        within = 0.5 * (evidence.pairs * (room[:, None] == room) * (room < rooms - 1)).sum(axis=1)
+        log += (within * np.minimum(PARTNERS / np.maximum(counts[room] - 1, 1), 1.0)).sum()
         if evidence.expected is not None:
             expected = counts[:-1].sum() * evidence.expected
             log -= (evidence.crowding * np.square(counts[:-1] - expected) / (2.0 * (expected + 1.0))).sum()

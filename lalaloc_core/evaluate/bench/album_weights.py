@@ -34,7 +34,7 @@ from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 _MOST = 8
 _TEMPERATURES, _MISREAD = (1.0, 0.5, 0.25), (0.1, 0.2)
 # Pairs draw photographs together, crowding apart.
-_PAIRS_CROWDING = ((0.12, 1.6), (0.12, 3.2), (0.25, 1.6), (0.25, 3.2), (0.25, 6.4), (0.5, 6.4))
+_PAIRS_CROWDING = ((0.3, 1.6), (0.3, 3.2), (0.6, 0.8), (0.6, 1.6), (0.6, 3.2), (1.2, 3.2))
 # Names of albums in the plans of other homes begin so; their weight beside a source of its own plans; ridge.
 _FOREIGN, _OTHERS, _RIDGE = "foreign", 0.11, 1e-4
 

@@ -30,9 +30,6 @@ _CERTAIN_MATCHES = 24
 # Share of the pairs of one room that are among the most similar ones, and limits of similarity and log odds.
 _FOUND, _ALIKE, _UNLIKE = 0.65, 0.4, 0.25
 _COLOUR_ODDS = (-2.0, 3.0)
-# Photographs of a room on average beyond which pairs count less, so that those of a photograph have the same weight
-# together.
-_FEW = 3.0
 # Matches of a pair, and turn (radians; NaN if none was found).
 Found = tuple[int, float]
 
@@ -62,13 +59,8 @@ def find_links(
     return found
 
 
-def pair_odds(
-    photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found], rooms: int, weight: float
-) -> Float[np.ndarray, "n n"]:
-    """Return the log odds that two photographs are of one of some rooms, symmetric, with zeros on the diagonal.
-
-    They count by a weight, since pairs are no independent signs.
-    """
+def pair_odds(photographs: Sequence[AlbumPhotograph], links: dict[tuple[int, int], Found]) -> Float[np.ndarray, "n n"]:
+    """Return the log odds that two photographs are of one room, symmetric, with zeros on the diagonal."""
     count = len(photographs)
     total = _colour_odds(photographs)
     for (first, second), (matches, turn) in links.items():
@@ -76,7 +68,7 @@ def pair_odds(
         total[first, second] += odds
         total[second, first] += odds
     total[np.arange(count), np.arange(count)] = 0.0
-    return weight * min(_FEW * rooms / count, 1.0) * total
+    return total
 
 
 def is_one_place(found: Found) -> bool:

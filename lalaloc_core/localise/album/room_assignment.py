@@ -41,6 +41,9 @@ _FEWEST = 12
 _LONGEST = 6
 # Storeys whose exchange is tried: the largest ones, of at least so many rooms.
 _MOST_STOREYS, _STOREY_ROOMS = 4, 2
+# Pairs of a room count like those of each photograph with so many others, as photographs of a room that look alike are
+# no independent signs: their sum would draw all photographs of a home with white walls into one room.
+PARTNERS = 3.0
 # Probability that the next photograph is of the same room, that it is of any room at all, and the weight of rooms that
 # are a further door away over that of nearer ones; walks are followed through so many doors.
 _STAY, _ANYWHERE, _FURTHER, _DOORS = 0.5, 0.3, 0.5, 4
@@ -62,7 +65,7 @@ class RoomEvidence:
         walk: (r, r) log probability of the next photograph's room, by that of a photograph; None without an order.
         follows: (n,) whether a photograph follows the one before it on a walk; never the first.
         pairs: (n, n) log odds that two photographs are of one room, symmetric, zero on the diagonal; they do not count
-            elsewhere, which is no room.
+            elsewhere, which is no room, and in rooms of many photographs less (`PARTNERS`).
         expected: (r - 1,) share that each room has a priori of the photographs that are of any; None for no prior.
         storeys: rooms of each storey; empty for no exchange of them.
     """
@@ -138,6 +141,9 @@ class _Chains:
         self._linked = np.einsum("tu,cur->ctr", self._pairs, one_hot)
         self._linked[:, :, -1] = 0.0
         self._counts = one_hot.sum(axis=1)
+        # Sum of the log odds of the pairs within each room, and what it counts by the number of photographs.
+        self._within = 0.5 * np.einsum("ctr,ctr->cr", self._linked, one_hot)
+        self._share = np.minimum(PARTNERS / np.maximum(np.arange(count + 1) - 1.0, 1.0), 1.0)
         self._exchanges = _exchanges(evidence)
 
     def sweep(self) -> Float[np.ndarray, "n r"]:
@@ -165,10 +171,6 @@ class _Chains:
     def _prior_with(self, counts: Float[np.ndarray, "c r"], more: Float[np.ndarray, "#c"]) -> Float[np.ndarray, "c r"]:
         """Return the log prior with more photographs in each of the rooms."""
         inside, away = counts[:, :-1], counts[:, -1].astype(int)
-        if not self._crowding:
-            found = np.broadcast_to(self._away[away][:, None], counts.shape).copy()
-            found[:, -1] = self._away[away + more.astype(int)]
-            return found
         expected = (inside.sum(axis=1) + more)[:, None] * self._expected
         weight, off = self._crowding / (expected + 1.0), inside - expected
         found = np.empty(counts.shape)
@@ -184,7 +186,10 @@ class _Chains:
         room, before = self._room, self._room[:, number].copy()
         others = self._counts.copy()
         others[self._each, before] -= 1.0
-        log = self._alone[number] + self._linked[:, number] + self._prior_with(others, np.ones(1))
+        within = self._within.copy()
+        within[self._each, before] -= self._linked[self._each, number, before]
+        log = self._alone[number] + self._of_pairs(within + self._linked[:, number], others + 1.0)
+        log += self._prior_with(others, np.ones(1)) - self._of_pairs(within, others)
         if self._follows[number]:
             log = log + self._walk[room[:, number - 1]]
         if number + 1 < room.shape[1] and self._follows[number + 1]:
@@ -218,12 +223,14 @@ class _Chains:
         size = mask.sum(axis=1)
         others = self._counts.copy()
         others[self._each, present] -= size
-        log = mask @ self._alone + (mask[:, None, :] @ self._linked)[:, 0]
         # Pairs within the set stay pairs in whichever room it goes to.
-        within = ((mask @ self._pairs) * mask).sum(axis=1)
-        log[self._each, present] -= np.where(present < self._rooms - 1, within, 0.0)
-        log[:, -1] -= 0.5 * within
-        log += self._prior_with(others, size.astype(float))
+        own = 0.5 * ((mask @ self._pairs) * mask).sum(axis=1)[:, None]
+        linked = (mask[:, None, :] @ self._linked)[:, 0]
+        linked[:, :-1] += np.where(np.arange(self._rooms - 1) == present[:, None], -own, own)
+        within = self._within.copy()
+        within[self._each, present] -= linked[self._each, present]
+        log = mask @ self._alone + self._of_pairs(within + linked, others + size[:, None])
+        log += self._prior_with(others, size.astype(float)) - self._of_pairs(within, others)
         first, second = mask[:, :-1], mask[:, 1:]
         log += (first & second & self._follows[1:]).sum(axis=1)[:, None] * np.diag(self._walk)
         # The ends of the set, whose neighbours are of other rooms or not of the set.
@@ -236,6 +243,10 @@ class _Chains:
         if whole:
             log[others > 0.0] = -np.inf
         self._relabel(mask, self._drawn(log))
+
+    def _of_pairs(self, within: Float[np.ndarray, "c r"], counts: Float[np.ndarray, "c r"]) -> Float[np.ndarray, "c r"]:
+        """Return the log odds of the pairs of each room, by their sum and the number of photographs."""
+        return self._share[counts.astype(int)] * within
 
     def _random_exchange(self) -> Int[np.ndarray, "c r"]:
         """Return an exchange of a photograph's room with any other."""
@@ -253,13 +264,14 @@ class _Chains:
         gain = self._energy(room, counts) - self._energy(self._room, self._counts)
         for chain in np.flatnonzero(np.log(self._rng.random(_CHAINS)) < gain / self._heat).tolist():
             self._room[chain], self._counts[chain] = room[chain], counts[chain]
+            self._within[chain] = self._within[chain][rooms[chain]]
             changed = np.flatnonzero(rooms[chain] != np.arange(self._rooms))
             self._linked[chain][:, changed] = self._linked[chain][:, rooms[chain, changed]]
 
     def _exchange_heats(self, first: int) -> None:
         """Exchange the states of neighbouring temperatures: 0 and 1, 2 and 3, ..., or from the second on."""
         energy = self._energy(self._room, self._counts)
-        energy += 0.5 * np.take_along_axis(self._linked, self._room[:, :, None], axis=2).sum(axis=(1, 2))
+        energy += self._of_pairs(self._within, self._counts).sum(axis=1)
         for colder, hotter in zip(self._ladder.T[first:-1:2], self._ladder.T[first + 1 :: 2], strict=True):
             gain = (1.0 / self._heat[colder] - 1.0 / self._heat[hotter]) * (energy[hotter] - energy[colder])
             accepted = np.log(self._rng.random(_LADDERS)) < gain
@@ -283,9 +295,11 @@ class _Chains:
         np.add.at(self._counts, (chain, before), -1.0)
         np.add.at(self._counts, (chain, new), 1.0)
         for c, t, a, b in zip(chain.tolist(), number.tolist(), before.tolist(), new.tolist(), strict=True):
+            self._within[c, a] -= self._linked[c, t, a]
             self._linked[c, :, a] -= self._pairs[t]
+            self._within[c, b] += self._linked[c, t, b]
             self._linked[c, :, b] += self._pairs[t]
-        self._linked[:, :, -1] = 0.0
+        self._linked[:, :, -1] = self._within[:, -1] = 0.0
         self._room[chain, number] = new
 
 

@@ -93,7 +93,7 @@ def solve_album(
     walk = walk_order(ordered, links)
     seen = (encoder.seen_objects([(each.photograph, 0.0)]) for each in ordered)
     # Log likelihood ratios of a photograph taken outside to one of a room; 0 if no objects are known.
-    outside = [0.0 if objects is None else objects.outside for objects in seen]
+    outside = np.array([0.0 if objects is None else objects.outside for objects in seen])
     # What a person stated, and what is taken outside, does not tell how well the plan is read.
     telling = [
         state.rooms / state.photographs
@@ -102,9 +102,12 @@ def solve_album(
     ]
     misread = misread_share(telling, weights.misread)
     named = types_by_names(ground.plan, ordered)
-    share = _room_shares(
-        ground, encoder, ordered, memory, states, links, constraints, walk, misread, outside, named, pause
-    )
+    own = named + [
+        state.evidence(misread) + room_types(ground.plan, encoder, each.photograph, memory.evidence[each.id])
+        for each, state in zip(ordered, states, strict=True)
+    ]
+    pairs = weights.pairs * pair_odds(ordered, links)
+    share = _room_shares(ground, ordered, own, outside, constraints, walk, pairs, weights.crowding, pause)
     misfit = () if misread <= weights.misfit else (_MISFIT_WARNING.format(100.0 * misread),)
     share = calibrated(share, misread, weights)
     pins = {
@@ -213,26 +216,23 @@ def _states(
 
 def _room_shares(
     ground: AlbumGround,
-    encoder: PhotographEncoder,
     photographs: Sequence[AlbumPhotograph],
-    memory: AlbumMemory,
-    states: Sequence[States],
-    links: dict[tuple[int, int], Found],
+    own: Float[np.ndarray, "n r"],
+    outside: Float[np.ndarray, "n"],
     constraints: dict[str, Constraint],
     walk: WalkOrder,
-    misread: float,
-    outside: Sequence[float],
-    named: Float[np.ndarray, "n r"],
+    pairs: Float[np.ndarray, "n n"],
+    crowding: float,
     pause: Callable[[], object],
 ) -> Float[np.ndarray, "n s"]:
-    """Return the probability of every room for every photograph; the last is none of the rooms."""
-    rooms, weights = len(ground.plan.rooms), encoder.manifest.album
-    alone = np.empty((len(photographs), rooms + 1))
-    for number, (each, state) in enumerate(zip(photographs, states, strict=True)):
-        types = room_types(ground.plan, encoder, each.photograph, memory.evidence[each.id])
-        alone[number, :rooms] = state.evidence(misread) + types + named[number]
-        # Half of the photographs of none of the rooms are taken outside.
-        alone[number, rooms] = float(np.logaddexp(0.0, outside[number])) - math.log(2.0)
+    """Return the probability of every room for every photograph; the last is none of the rooms.
+
+    `own` is the log likelihood of each photograph in each room, and `outside` that outside over that in a room.
+    """
+    rooms = len(ground.plan.rooms)
+    # Half of the photographs of none of the rooms are taken outside.
+    alone = np.column_stack([own, np.logaddexp(0.0, outside) - math.log(2.0)])
+    for number, each in enumerate(photographs):
         if each.id in constraints:
             wanted = constraints[each.id].room
             alone[number] -= _CERTAIN
@@ -249,10 +249,10 @@ def _room_shares(
         alone=alone,
         walk=walk_of(ground) if follows.any() else None,
         follows=follows,
-        pairs=pair_odds(photographs, links, rooms, weights.pairs)[np.ix_(order, order)],
+        pairs=pairs[np.ix_(order, order)],
         # Albums of fewer photographs than rooms have no expectation.
         expected=expected if len(photographs) >= rooms else None,
-        crowding=weights.crowding,
+        crowding=crowding,
         storeys=storeys_of(ground),
     )
     share = np.empty(alone.shape)
