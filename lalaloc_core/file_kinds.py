@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 _TABLE = tomllib.loads(Path(__file__).with_name("file_kinds.toml").read_text(encoding="utf-8"))
-HEIC, AVIF = _TABLE["heic"], _TABLE["avif"]
+HEIC, AVIF, VIDEO = _TABLE["heic"], _TABLE["avif"], _TABLE["video"]
 _MAGIC, _BRANDS = (
     {text.encode("latin-1"): kind for text, kind in _TABLE[name].items()} for name in ("magic", "brands")
 )
@@ -57,11 +57,11 @@ def describe_file(content: bytes) -> str | None:
     for magic, kind in _MAGIC.items():
         if content.startswith(magic):
             return kind
-    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
-        return "a WebP picture"
+    if content[:4] == b"RIFF":
+        return _BRANDS.get(content[8:12])
     if content[4:8] == b"ftyp":
         is_av1 = content[8:12] in _ANY_CODEC and b"av01" in content[:_HEAD_BYTES]
-        return AVIF if is_av1 else _BRANDS.get(content[8:12], "a video")
+        return AVIF if is_av1 else _BRANDS.get(content[8:12], VIDEO)
     head = content[:_HEAD_BYTES]
     if _HTML.match(head.removeprefix(b"\xef\xbb\xbf")):
         return _TABLE["page"]

@@ -32,7 +32,7 @@ from lalaloc_core.photograph.file_segments import (
 )
 
 FORMATS = ("JPEG", "PNG", "WEBP")
-_SUPPORTED = "JPEG, PNG or WEBP"
+_SUPPORTED = "JPEG, PNG or WebP"
 # Colour of missing parts of the sphere: the mean that encoders subtract.
 NEUTRAL = (128, 128, 128)
 # Pictures with more pixels are scaled down in bands of about this size.
@@ -306,8 +306,10 @@ def _named_errors(content: bytes, limits: PhotographLimits) -> Iterator[None]:
                 "whole file"
             ) from error
         kind = describe_file(content) or "a picture"
+        # The decoder refuses more pixels than remain.
+        fault = "cut to a part without being coded anew" if kind == HEIC and b"clap" in content else "damaged"
         raise InvalidPhotographError(
-            f"the photograph is {kind} that is damaged, or coded in a way that is not supported; save or export it as "
+            f"the photograph is {kind} that is {fault}, or coded in a way that is not supported; save or export it as "
             f"{_SUPPORTED}"
         ) from error
 
@@ -319,7 +321,7 @@ def _unreadable(content: bytes) -> str:
     if kind == HEIC:
         return f"the photograph is {kind}, which is damaged; save or export it as {_SUPPORTED}"
     if kind is None or kind.removeprefix("a ").removesuffix(" picture").upper() in FORMATS:
-        return f"the photograph is not a readable {_SUPPORTED} or HEIC picture"
+        return f"the photograph is not a readable JPEG, PNG, WebP or HEIC picture; save or export it as {_SUPPORTED}"
     return f"the photograph is {kind}, which is not supported; save or export it as {_SUPPORTED}"
 
 
