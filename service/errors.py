@@ -205,11 +205,20 @@ class UnmeasuredModelError(ServiceError, problem=(501, "model-unmeasured", "Mode
     """The model has no measured errors, which predictions need."""
 
 
+_SMALLER = {
+    "max_photograph_bytes": "send the photograph as a JPEG, whose longer side needs 4000 pixels at most",
+    "max_sequence_bytes": "send fewer photographs at once, or smaller ones",
+    "max_film_bytes": "cut the film to one turn, or record it in Full HD",
+}
+
+
 class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Upload too large")):
-    message = "the body {}; the limit is {} bytes (LALALOC_{})"
+    message = "the body {}; the limit is {} bytes (LALALOC_{}): {}"
 
     def __init__(self, setting: str, limit: int, stated: int | None = None) -> None:
-        super().__init__("is too large" if stated is None else f"has {stated} bytes", limit, setting.upper())
+        size = "is too large" if stated is None else f"has {stated} bytes"
+        remedy = _SMALLER.get(setting, "send less at once, pictures in a lower resolution, or plans one by one")
+        super().__init__(size, limit, setting.upper(), remedy)
 
 
 class BytesInFlightError(ServiceError, problem=(503, "overloaded", "Overloaded")):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -40,6 +41,7 @@ _MEMORY_BYTES = 256 * 2**20
 _MAX_CPU_S = 3600.0
 # Photographs that the plans of a large venue are chosen by.
 _CHOOSING = 8
+_ABOUT_CAMERA = re.compile(r"\bsend (?=projection|hfov_deg|intrinsics)")
 
 
 class _Stopped(Exception):
@@ -61,7 +63,11 @@ class AlbumSearch:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):
-            view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
+            try:
+                view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
+            except InvalidPhotographError as error:
+                raise InvalidPhotographError(_in_album(str(error))) from error
+            view = replace(view, warnings=tuple(map(_in_album, view.warnings)))
         if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
             raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
 
@@ -182,6 +188,11 @@ def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
     ids = tuple(record.id for record in ground.records)
     merged = ground.merged or MergedPlans.of_plan(ground.plan, ground.grid)
     return AlbumGround(ids, replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan)))
+
+
+def _in_album(text: str) -> str:
+    """Return an advice about a photograph for albums, whose camera is stated when they are created."""
+    return _ABOUT_CAMERA.sub("create an album with ", text)
 
 
 def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:
