@@ -58,6 +58,42 @@ def test_clock_difference_is_found_by_common_places() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("names", "bodies", "cameras"),
+    [
+        (("IMG_1.jpg", "IMG_2.jpg"), ("", ""), 1),
+        (("IMG_1.jpg", "DSC_2.jpg"), ("", ""), 2),
+        (("IMG_1.jpg", "IMG_2.jpg"), ("b0d1e5", "ca7f00"), 2),
+    ],
+)
+def test_cameras_of_one_model_have_clocks_of_their_own(
+    names: tuple[str, str], bodies: tuple[str, str], cameras: int
+) -> None:
+    album = [
+        replace(each, name=names[number // 3], taken=replace(each.taken, body=bodies[number // 3]))
+        for number, each in enumerate(_album(*(("A", at) for at in _minutes(0, 2, 4, 61, 63, 65))))
+    ]
+    found = walk_order(album, {(0, 3): _CERTAIN, (1, 4): _CERTAIN, (2, 5): _CERTAIN})
+    assert found.order.tolist() == ([0, 3, 1, 4, 2, 5] if cameras == 2 else [*range(6)])
+    assert len(found.warnings) == cameras - 1
+    assert cameras == 1 or f"the clock of A (of '{names[1]}') is 1:01:00 ahead of that of A (of" in found.warnings[0]
+
+
+def test_times_that_contradict_the_numbers_in_names_are_named() -> None:
+    at = [time for pair in zip(_minutes(0, 2, 4, 6), _minutes(61, 63, 65, 67), strict=True) for time in pair]
+    album = [
+        replace(each, name=f"IMG_{number}.jpg") for number, each in enumerate(_album(*(("A", time) for time in at)))
+    ]
+    (text,) = walk_order(album, {}).warnings
+    assert text.startswith("the times of A contradict the numbers in the names of its photographs")
+    assert walk_order([replace(each, name="") for each in album], {}).warnings == ()
+
+
+def test_a_time_that_all_photographs_have_is_not_theirs() -> None:
+    found = walk_order(_album(*(("A", at) for at in _minutes(0, 0, 0))), {})
+    assert found.warnings[0].startswith("3 of 3 photographs have no time of their own, so no place in the order")
+
+
 def test_clocks_that_cannot_be_compared_order_each_camera() -> None:
     own, other = _minutes(4, 0, 2), _minutes(1, 5)
     found = walk_order(_album(*(("A", at) for at in own), *(("B", at) for at in other)), {(0, 3): _CERTAIN})
@@ -153,6 +189,9 @@ def test_times_of_xmp_and_of_gps_count_without_others(name: bytes) -> None:
     assert read_taken(exif, packets, width=0, height=0).at == _TEN.replace(second=30, tzinfo=UTC)
     exif.get_ifd(0x8769)[0x9003] = "2026:05:01 09:00:00"
     assert read_taken(exif, packets, width=0, height=0).at == datetime(2026, 5, 1, 9)
+    exif.get_ifd(0x8769).update({0x9010: "+02:00", 0xA431: "A 123"})
+    taken = read_taken(exif, packets, width=0, height=0)
+    assert (taken.at, len(taken.body)) == (datetime(2026, 5, 1, 7, tzinfo=UTC), 6)
 
 
 def _picture(path: Path, minute: int | None = None) -> None:
@@ -170,6 +209,10 @@ def test_turns_are_ordered_by_time_else_by_the_numbers_in_names(tmp_path: Path) 
     for number, minute in ((1, 5), (2, 3), (10, 4)):
         _picture(tmp_path / f"{number}.jpg", minute)
     assert [file.stem for file in turn_files(tmp_path)[0]] == ["2", "10", "1"]
+    assert turn_files(tmp_path)[1] == []
+    _picture(tmp_path / "2.jpg", 5)
+    assert [file.stem for file in turn_files(tmp_path)[0]] == ["1", "2", "10"]
+    assert turn_files(tmp_path)[1][0].startswith("1 of 3 photographs have no time of their own, so all are in the ord")
 
 
 def test_empty_and_hidden_files_of_a_turn_are_left_out_and_named(tmp_path: Path) -> None:

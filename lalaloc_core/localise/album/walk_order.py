@@ -13,7 +13,8 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
+from itertools import pairwise
 from pathlib import PurePath
 
 import numpy as np
@@ -21,7 +22,6 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.links import Found, is_one_place, similarity
-from lalaloc_core.photograph.exif import Taken
 from lalaloc_core.photograph.picture_folders import with_numbers
 
 # Share of the photographs by a clock that must have a time for its order to count, and of those without a time whose
@@ -33,8 +33,9 @@ _ALIKE = 1.2
 _VISIT_S = 3.0 * 3600.0
 # Photographs of one place by two cameras are taken within this time (s); pairs that must agree on a difference.
 _PLACE_S, _MIN_PAIRS, _MIN_SHARE = 300.0, 3, 0.5
-# Smaller differences of clocks (s) are not reported; cameras that are named.
-_SAME_S, _MAX_NAMED = 60.0, 5
+# Smaller differences of clocks (s) are not reported; cameras that are named; share of the steps from one number in
+# names to the next in which times can go back: counters begin again, and folders hold several visits.
+_SAME_S, _MAX_NAMED, _BACK = 60.0, 5, 0.2
 _ZONED = "cameras with time zones"
 
 
@@ -55,8 +56,9 @@ class WalkOrder:
 
 def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found]) -> WalkOrder:
     """Return the order in which photographs were taken, as far as clocks or names tell; `links` are by their number."""
-    zones = {_name(each.taken): each.taken.at.tzinfo for each in photographs if each.taken.at and each.taken.at.tzinfo}
-    seconds, rows_of = _seconds(photographs, zones), _clocks(photographs, zones)
+    cameras, taken = _cameras(photographs), [each.taken.at for each in photographs]
+    zones = {camera: at.tzinfo for camera, at in zip(cameras, taken, strict=True) if at is not None and at.tzinfo}
+    seconds, rows_of = _seconds(cameras, taken, zones), _clocks(cameras, zones)
     names = [name for name, rows in rows_of.items() if np.isfinite(seconds[rows]).mean() >= _TIMED]
     # Cameras with time zones are right, so the others are compared with them.
     names.sort(key=lambda name: name != _ZONED)
@@ -68,6 +70,12 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
     numbered = _numbered(photographs, untimed)
     is_walk = len(numbered) > 0 and _are_alike([photographs[row] for row in numbered])
     warnings = _on_missing(photographs, untimed, int(((clock < 0) & ~untimed).sum()), numbered, is_walk=is_walk)
+    warnings += [
+        f"the times of {name} contradict the numbers in the names of its photographs, as of two cameras of one model: "
+        "its times are used; pin the photographs of each camera by themselves, or correct the times"
+        for name in names
+        if _goes_back([photographs[row] for row in rows_of[name]], seconds[rows_of[name]])
+    ]
     walk, ahead_s = _joined(len(names), _differences(seconds, clock, links))
     for number, (first, difference_s) in enumerate(zip(walk, ahead_s, strict=True)):
         if abs(difference_s) > _SAME_S:
@@ -81,7 +89,7 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
         more = f" and {len(names) - _MAX_NAMED} others" if len(names) > _MAX_NAMED else ""
         warnings.append(
             f"the clocks of {', '.join(names[:_MAX_NAMED])}{more} could not all be compared, so photographs are in "
-            "order within each camera only"
+            "order within each camera only: correct the times of one, or add photographs of the same places by both"
         )
     is_timed = clock >= 0
     of_walk = np.where(is_timed, np.array([*walk, -1])[clock], -1)
@@ -131,10 +139,10 @@ def _on_missing(
     """Return warnings on photographs without a time, and on those whose time is not used."""
     found, count = [], len(photographs)
     if untimed.any():
-        text = f"{untimed.sum()} of {count} photographs have no time, so no place in the order"
+        text = f"{untimed.sum()} of {count} photographs have no time of their own, so no place in the order"
         if len(numbered):
             first, last = (photographs[row].name for row in (numbered[0], numbered[-1]))
-            text = f"{untimed.sum()} of {count} photographs have no time: " + (
+            text = f"{untimed.sum()} of {count} photographs have no time of their own: " + (
                 f"{len(numbered)} are in the order of the numbers in their names, from '{first}' to '{last}'"
                 if is_walk
                 else "the numbers in their names tell no order, as neighbours look no more alike than others"
@@ -148,27 +156,69 @@ def _on_missing(
     return found
 
 
-def _name(taken: Taken) -> str:
-    return " ".join(filter(None, (taken.make, taken.model))) or "an unknown camera"
+def _cameras(photographs: Sequence[AlbumPhotograph]) -> list[str]:
+    """Return the camera of each photograph, by maker and model, and of several of one model by its first photograph.
+
+    Serial numbers tell these apart, else how names begin, if times are apart as by clocks that differ.
+    """
+    of_model: defaultdict[str, list[int]] = defaultdict(list)
+    for row, each in enumerate(photographs):
+        of_model[" ".join(filter(None, (each.taken.make, each.taken.model))) or "an unknown camera"].append(row)
+    cameras = [""] * len(photographs)
+    for model, rows in of_model.items():
+        alike = [photographs[row] for row in rows]
+        bodies = [each.taken.body for each in alike]
+        keys = bodies if len(set(bodies)) > 1 else _beginnings(alike)
+        first = {key: each.name for key, each in zip(reversed(keys), reversed(alike), strict=True)}
+        for row, key in zip(rows, keys, strict=True):
+            cameras[row] = model if len(first) == 1 else f"{model} (of '{first[key]}')"
+    return cameras
 
 
-def _seconds(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> Float[np.ndarray, "n"]:
-    """Return the times of photographs, of those without a time zone by the camera's clock; NaN without any."""
-    seconds = np.full(len(photographs), np.nan)
-    for number, photograph in enumerate(photographs):
-        taken = photograph.taken
-        if taken.at is not None:
-            zone = taken.at.tzinfo or zones.get(_name(taken), UTC)
-            seconds[number] = taken.at.replace(tzinfo=zone).timestamp()
+def _beginnings(photographs: Sequence[AlbumPhotograph]) -> list[str]:
+    """Return how the names of photographs begin, if those that begin alike are before or after the others."""
+    begins = [re.sub(r"\d.*", "", PurePath(each.name).stem.lower()) for each in photographs]
+    times: defaultdict[str, list[datetime]] = defaultdict(list)
+    for begin, each in zip(begins, photographs, strict=True):
+        times[begin] += [] if each.taken.at is None else [each.taken.at.replace(tzinfo=None)]
+    are_many = all(len(each) >= _MIN_PAIRS for each in times.values())
+    spans = sorted((min(each), max(each)) for each in times.values() if are_many)
+    is_apart = are_many and all(last < first for (_, last), (first, _) in pairwise(spans))
+    return begins if is_apart else [""] * len(begins)
+
+
+def _goes_back(photographs: Sequence[AlbumPhotograph], seconds: Float[np.ndarray, "n"]) -> bool:
+    """Return whether times often go back along the numbers in names that are alike but for these."""
+    names = [PurePath(each.name).stem.lower() for each in photographs]
+    kinds = {re.sub(r"\d+", "#", name) for name in names}
+    if len(kinds) > 1 or "#" not in "".join(kinds):
+        return False
+    steps = np.diff(seconds[sorted(range(len(names)), key=lambda row: with_numbers(names[row]))])
+    return int((steps < -_SAME_S).sum()) >= max(_MIN_PAIRS, _BACK * len(steps))
+
+
+def _seconds(
+    cameras: Sequence[str], taken: Sequence[datetime | None], zones: Mapping[str, tzinfo]
+) -> Float[np.ndarray, "n"]:
+    """Return the times of photographs, of those without a time zone by the camera's clock; NaN without any.
+
+    A time that all of a camera's photographs have is not theirs.
+    """
+    seconds = np.full(len(taken), np.nan)
+    for number, (camera, at) in enumerate(zip(cameras, taken, strict=True)):
+        if at is not None:
+            seconds[number] = at.replace(tzinfo=at.tzinfo or zones.get(camera, UTC)).timestamp()
+    for rows in _clocks(cameras, {}).values():
+        if len(rows) >= _MIN_PAIRS and len(np.unique(seconds[rows])) == 1:
+            seconds[rows] = np.nan
     return seconds
 
 
-def _clocks(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> dict[str, Int[np.ndarray, "m"]]:
+def _clocks(cameras: Sequence[str], zones: Mapping[str, tzinfo]) -> dict[str, Int[np.ndarray, "m"]]:
     """Return the numbers of the photographs by clock; cameras that state time zones have one clock together."""
     found: dict[str, list[int]] = {}
-    for number, photograph in enumerate(photographs):
-        name = _name(photograph.taken)
-        found.setdefault(_ZONED if name in zones else name, []).append(number)
+    for number, camera in enumerate(cameras):
+        found.setdefault(_ZONED if camera in zones else camera, []).append(number)
     return {name: np.array(rows) for name, rows in found.items()}
 
 

@@ -192,8 +192,8 @@ def overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
     for index, angle in enumerate(angles):
         groups.setdefault(angle.group, []).append(index)
     remedy = (
-        f"turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph to the next, or "
-        "state the relative headings"
+        "send them in the order in which they were taken, turn by at most half the field of view, "
+        f"{math.degrees(0.5 * hfov):.0f}°, from one photograph to the next, or state the relative headings"
     )
     if len(groups) > 1:
         names = "; ".join(", ".join(f"photo[{index}]" for index in groups[group]) for group in sorted(groups))
