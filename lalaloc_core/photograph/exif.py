@@ -34,6 +34,7 @@ _NOT_APPLIED = re.compile(rb":AlreadyApplied\s{0,9}(?:=\s{0,9}.|>)\s{0,9}[Ff]als
 _SIZES = re.compile(rb"tiff:Image(Width|Length)\s{0,9}(?:=\s{0,9}.|>)\s{0,9}(\d{1,6})")
 # Editors, after which a picture can be a part of what its focal length is for.
 _EDITORS = re.compile("affinity|canva|darktable|gimp|google|irfan|light ?room|paint|photo|pic|pix|snap|therapee", re.I)
+_SUBJECT_AREA = 0x9214
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
 _FOCAL_RANGE_MM = (0.5, 250.0)
@@ -134,6 +135,9 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
         focal = zoom * lens / side_mm * long
     is_edited = _EDITORS.search(_text(exif.get(ExifTags.Base.Software))) is not None
     is_edited |= any(side % _MULTIPLE for side in (width, height))
+    # The middle of what was focused on, in the picture as it was taken.
+    focused = tags.get(_SUBJECT_AREA)
+    is_edited |= isinstance(focused, tuple) and any((finite_number(side) or 0.0) > long for side in focused[:2])
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
     camera = " ".join(_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)).strip()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -47,6 +48,7 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 SIDEWAYS = {5, 6, 7, 8}
+_FRONT = re.compile(r"\bfront\b", re.IGNORECASE)
 _WHOLE = 0.0, 0.0, 1.0, 1.0
 # Ratios of sides that differ by less (relative) are of one picture.
 _SAME_RATIO = 0.01
@@ -147,7 +149,10 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
     is_untold = unused != 1 and b"irot" not in content and b"imir" not in content
     if is_untold:
         exif.pop(ExifTags.Base.Orientation, None)
+    lens = str(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.LensModel, ""))
     faults = {
+        f"the photograph is of a front camera (Exif LensModel '{lens[:60]}'), which can save it mirrored: check that "
+        "texts in it can be read, else mirror it": _FRONT.search(lens) is not None and lens.isprintable(),
         f"the Exif orientation {orientation} was ignored, because the picture was turned after it was taken: the Exif "
         "size is that of a picture on its side; send the camera's original file if this is wrong": was_turned,
         f"the Exif orientation {unused} was ignored, as HEIC pictures state their turn otherwise, and this one states "

@@ -219,8 +219,10 @@ class TestTilt:
         assert np.median(np.abs(errors), axis=0).max() < 1.0
         assert (np.abs(errors) < 3.0 * np.array(deviations)).mean() > 0.85
 
-    def test_blank_wall_tells_nothing_about_the_tilt(self) -> None:
-        view = opened(jpeg(np.full((480, 640, 3), 200, np.uint8)), hfov_deg=67.0)
+    @pytest.mark.parametrize("light", [200, 8])
+    def test_blank_wall_tells_nothing_about_the_tilt(self, light: int) -> None:
+        view = opened(jpeg(np.full((480, 640, 3), light, np.uint8)), hfov_deg=67.0)
+        assert [text.split(",")[0] for text in view.warnings] == ["the photograph is dark"] * (light < 12)
         assert view.pitch.source == view.roll.source == "assumed"
         assert math.degrees(view.pitch.sd) > 10.0
 
@@ -372,7 +374,8 @@ def test_lines_of_a_picture_in_perspective_are_straight(name: str, heading_deg: 
 def test_camera_with_an_orientation_or_a_stated_tilt_tells_which_side_is_up() -> None:
     upright = view_of(MAIN, heading_deg=120.0)
     by_software, by_camera = jpeg(upright, orientation=1), jpeg(upright, orientation=1, maker="Phone")
-    assert [opened(content).is_upright for content in (by_software, by_camera)] == [False, True]
+    by_editor = jpeg(upright[:-1], orientation=1, maker="Phone")
+    assert [opened(content).is_upright for content in (by_software, by_camera, by_editor)] == [False, True, False]
     assert opened(by_software, pitch_deg=40.0).is_upright
 
 
