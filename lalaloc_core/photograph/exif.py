@@ -15,7 +15,6 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
-from hashlib import sha256
 from pathlib import Path
 
 from PIL import ExifTags, Image
@@ -34,7 +33,6 @@ _NOT_APPLIED = re.compile(rb":AlreadyApplied\s{0,9}(?:=\s{0,9}.|>)\s{0,9}[Ff]als
 _SIZES = re.compile(rb"tiff:Image(Width|Length)\s{0,9}(?:=\s{0,9}.|>)\s{0,9}(\d{1,6})")
 # Editors, after which a picture can be a part of what its focal length is for.
 _EDITORS = re.compile("affinity|canva|darktable|gimp|google|irfan|light ?room|paint|photo|pic|pix|snap|therapee", re.I)
-_SUBJECT_AREA = 0x9214
 _UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _FILM_RANGE_MM = (4.0, 250.0)
 _FOCAL_RANGE_MM = (0.5, 250.0)
@@ -48,8 +46,8 @@ _SHAPES, _SHAPE_SD, _MULTIPLE = (1.0, 8 / 7, 1.25, 4 / 3, 1.5, 16 / 9, 2.0, 2.06
 _STRIP = 6
 # Relative standard deviations of the focal length: rounding and lens of the usual shapes, and of cropped sensors.
 _SD, _CROPPED_SD = 0.03, 0.06
-# Characters of a maker's or model's name, and of the digest of a serial number.
-MAX_NAME, _BODY_DIGITS = 60, 6
+# Characters of a maker's or model's name.
+MAX_NAME = 60
 # The farthest time zones from UTC, in minutes.
 _MAX_OFFSET_MIN = 14 * 60
 # Times as cameras and editors write them: "2024:05:01 10:20:30", "2024-05-01T10:20:30.5+02:00", "2024/5/1 3:20 PM".
@@ -96,14 +94,12 @@ class Taken:
 
     Attributes:
         at: time by the camera's clock, with its time zone if the file states one.
-        body: digits of a digest of the camera's serial number, which tell cameras of one model apart.
         width, height: size of the upright picture, pixels.
     """
 
     at: datetime | None = None
     make: str = ""
     model: str = ""
-    body: str = ""
     width: int = 0
     height: int = 0
 
@@ -135,9 +131,6 @@ def read_exif_lens(exif: Image.Exif, packets: Sequence[bytes] = (), *, width: in
         focal = zoom * lens / side_mm * long
     is_edited = _EDITORS.search(_text(exif.get(ExifTags.Base.Software))) is not None
     is_edited |= any(side % _MULTIPLE for side in (width, height))
-    # The middle of what was focused on, in the picture as it was taken.
-    focused = tags.get(_SUBJECT_AREA)
-    is_edited |= isinstance(focused, tuple) and any((finite_number(side) or 0.0) > long for side in focused[:2])
     # Makers disagree whether the equivalent focal length includes digital zoom.
     doubt = 0.5 * math.log(zoom) if film is not None else 0.0
     camera = " ".join(_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model)).strip()
@@ -224,15 +217,13 @@ def read_taken(exif: Image.Exif, packets: Sequence[bytes], *, width: int, height
     """Read time and camera of an upright picture of `width` x `height` pixels, by Exif, XMP or GPS."""
     make, model = (_text(exif.get(tag)) for tag in (ExifTags.Base.Make, ExifTags.Base.Model))
     tags = exif.get_ifd(ExifTags.IFD.Exif)
-    serial = _text(tags.get(ExifTags.Base.BodySerialNumber)).encode()
-    body = sha256(serial).hexdigest()[:_BODY_DIGITS] if serial.strip(b"0") else ""
     # The time of the file's last change is not used.
     texts = [[_text(tags.get(tag)) for tag in names] for names in _TIMES]
     texts = [[at, digits, zone or _text(tags.get(ExifTags.Base.OffsetTime))] for at, digits, zone in texts]
     stated = sorted(found for packet in packets for found in _XMP_TIME.findall(packet))
     texts += [[text.decode(errors="replace").strip()] for _, text in stated]
     at = next(filter(None, (read_time(*text) for text in texts)), None) or _time_of_gps(exif)
-    return Taken(at=at, make=make, model=model, body=body, width=width, height=height)
+    return Taken(at=at, make=make, model=model, width=width, height=height)
 
 
 def _time_of_gps(exif: Image.Exif) -> datetime | None:

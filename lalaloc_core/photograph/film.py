@@ -27,7 +27,7 @@ from lalaloc_core.errors import InvalidFilmError
 from lalaloc_core.file_kinds import VIDEO, describe_file
 from lalaloc_core.photograph.exif import ExifLens, fisheye_of
 from lalaloc_core.photograph.film_motion import FlowTracker
-from lalaloc_core.photograph.overlap import LIKELY_SD, Step
+from lalaloc_core.photograph.overlap import LIKELY_SD, Step, shrunk
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
@@ -302,7 +302,7 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
             if samples.stored_size != frame.shape[1::-1]:
                 samples.dropped["of another size"] += 1
                 continue
-            picture = _shrunk(frame[samples.inside], _LONG_SIDE)
+            picture = shrunk(frame[samples.inside], _LONG_SIDE)
             samples.first = picture if samples.first is None else samples.first
             samples.changes = samples.changes or not np.array_equal(samples.first, picture)
             # A sample is followed while the next one is decoded, where there is a core for it.
@@ -331,7 +331,7 @@ def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Sample
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        samples.looks.append(_shrunk(picture, THUMBNAIL_SIDE))
+        samples.looks.append(shrunk(picture, THUMBNAIL_SIDE))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
@@ -339,11 +339,6 @@ def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Sample
     samples.add(
         _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
     )
-
-
-def _shrunk(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    share = min(long_side / max(picture.shape), 1.0)
-    return cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else picture
 
 
 def _inside_bars(samples: _Samples) -> tuple[slice, slice]:

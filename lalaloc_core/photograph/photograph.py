@@ -30,7 +30,7 @@ from lalaloc_core.photograph.levelling import (
     find_segments,
     lines_of,
 )
-from lalaloc_core.photograph.overlap import find_features
+from lalaloc_core.photograph.overlap import find_features, shrunk
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import FORMATS, PhotographLimits, PictureFile, opened_picture, scaled
@@ -289,10 +289,7 @@ class _Opened:
         is_plain = orientation == 1 and self.width == 2 * self.height and self.metadata.level
         is_fine = self.sphere_size[0] >= COARSEST[0]
         picture = self.sphere if is_plain and is_fine else self.picture(None, PatchSize())
-        share = min((COARSEST[1] if is_plain else THUMBNAIL_SIDE) / max(picture.shape), 1.0)
-        if share < 1.0:
-            size = (max(1, round(share * side)) for side in (picture.shape[1], picture.shape[0]))
-            picture = cv2.resize(picture, tuple(size), interpolation=cv2.INTER_AREA)
+        picture = shrunk(picture, COARSEST[1] if is_plain else THUMBNAIL_SIDE)
         return Thumbnail(picture, orientation)
 
     def sphere_format(self) -> SphereFormat | None:

@@ -26,7 +26,6 @@ from lalaloc_core.photograph.file_segments import (
     END,
     MAX_TEXT_BYTES,
     check_segments,
-    count_scans,
     lacks_end,
     without_large_texts,
     xmp_packets,
@@ -117,13 +116,12 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Picture
     if not content:
         raise InvalidPhotographError("the photograph is empty; if it is still in a cloud, download it first")
     _check_webp_size(content, limits)
-    check_segments(content)
+    check_segments(content, limits.max_scans)
     is_cut = lacks_end(content)
     # Without its end, the decoder refuses all of the picture.
     readable, left_out = (content + END, 0) if is_cut else without_large_texts(content)
     with _named_errors(content, limits), Image.open(io.BytesIO(readable), formats=_formats(content)) as image:
         _check_pixels(*image.size, limits)
-        _check_scans(content, limits)
         yield _file_of(image, content, readable, left_out)
 
 
@@ -350,12 +348,4 @@ def _check_pixels(width: int, height: int, limits: PhotographLimits) -> None:
         raise InvalidPhotographError(
             f"the photograph has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
             "(max_pixels)"
-        )
-
-
-def _check_scans(content: bytes, limits: PhotographLimits) -> None:
-    """Refuse JPEGs with many scans; each visits all pixels again."""
-    if count_scans(content, limits.max_scans) > limits.max_scans:
-        raise InvalidPhotographError(
-            f"the photograph is a JPEG with more than {limits.max_scans} scans, the limit (max_scans); save it again"
         )

@@ -27,6 +27,7 @@ from service.capacity.fair_share import FairSemaphore
 from service.capacity.threads import Threads
 from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
+from service.query.grounds import spread
 from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery, Where
 from service.query.single_query import QueryParts
 from service.schemas.albums import AlbumDocument, PhotographFacts
@@ -39,9 +40,6 @@ AT_A_TIME = 4
 _MEMORY_BYTES = 256 * 2**20
 # CPU time (s) of an album until it is solved, in all its turns; the largest ones need some minutes.
 _MAX_CPU_S = 3600.0
-# Photographs that the plans of a large venue are chosen by.
-_CHOOSING = 8
-_ABOUT_CAMERA = re.compile(r"\bsend (?=projection|hfov_deg|intrinsics)")
 
 
 class _Stopped(Exception):
@@ -97,7 +95,7 @@ class AlbumSearch:
             await site.wait(context)
             chosen: list[Query] = []
             if isinstance(where, VenueRecord):
-                spots = [Spot(entry.photograph) for entry in _spread(photographs)]
+                spots = [Spot(entry.photograph) for entry in spread(photographs)]
                 known, heights = [UNKNOWN_HEADING] * len(spots), [site.height] * len(spots)
                 chosen = await self._parts.reader.encode(spots, known, heights, context)
             ground = await site.ground(chosen, context)
@@ -169,11 +167,6 @@ def _size_of(memory: AlbumMemory) -> int:
     )
 
 
-def _spread(photographs: Sequence[AlbumPhotograph]) -> list[AlbumPhotograph]:
-    step = max(len(photographs) // _CHOOSING, 1)
-    return list(photographs[::step][:_CHOOSING])
-
-
 def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
     """Return the ground for the core; a stated camera height takes the place of the plans' own."""
 
@@ -192,7 +185,7 @@ def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
 
 def _in_album(text: str) -> str:
     """Return an advice about a photograph for albums, whose camera is stated when they are created."""
-    return _ABOUT_CAMERA.sub("create an album with ", text)
+    return re.sub(r"\bsend (?=projection|hfov_deg|intrinsics)", "create an album with ", text)
 
 
 def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:

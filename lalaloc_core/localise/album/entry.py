@@ -196,10 +196,9 @@ class _Header:
     width: int
     height: int
     features: int
-    body: str = ""
 
 
-_OF_CAMERA = ("make", "model", "body", "width", "height")
+_OF_CAMERA = ("make", "model", "width", "height")
 
 
 def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None, name: str = "") -> AlbumPhotograph:
@@ -241,7 +240,7 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         at = None if header.taken_at is None else datetime.fromisoformat(header.taken_at)
     except ValueError as error:
         raise InvalidEntryError(f"taken_at is '{header.taken_at!s:.50}', which is no time") from error
-    texts = {name: getattr(header, name) for name in _OF_CAMERA[:3]}
+    texts = {name: getattr(header, name) for name in _OF_CAMERA[:2]}
     faults = {
         "id": not 0 < len(header.id) <= _MAX_ID or not header.id.isprintable(),
         **{name: len(text) > MAX_NAME or not text.isprintable() for name, text in texts.items()},

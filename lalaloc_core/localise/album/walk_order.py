@@ -33,9 +33,8 @@ _ALIKE = 1.2
 _VISIT_S = 3.0 * 3600.0
 # Photographs of one place by two cameras are taken within this time (s); pairs that must agree on a difference.
 _PLACE_S, _MIN_PAIRS, _MIN_SHARE = 300.0, 3, 0.5
-# Smaller differences of clocks (s) are not reported; cameras that are named; share of the steps from one number in
-# names to the next in which times can go back: counters begin again, and folders hold several visits.
-_SAME_S, _MAX_NAMED, _BACK = 60.0, 5, 0.2
+# Smaller differences of clocks (s) are not reported; cameras that are named.
+_SAME_S, _MAX_NAMED = 60.0, 5
 _ZONED = "cameras with time zones"
 
 
@@ -70,12 +69,6 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
     numbered = _numbered(photographs, untimed)
     is_walk = len(numbered) > 0 and _are_alike([photographs[row] for row in numbered])
     warnings = _on_missing(photographs, untimed, int(((clock < 0) & ~untimed).sum()), numbered, is_walk=is_walk)
-    warnings += [
-        f"the times of {name} contradict the numbers in the names of its photographs, as of two cameras of one model: "
-        "its times are used; pin the photographs of each camera by themselves, or correct the times"
-        for name in names
-        if _goes_back([photographs[row] for row in rows_of[name]], seconds[rows_of[name]])
-    ]
     walk, ahead_s = _joined(len(names), _differences(seconds, clock, links))
     for number, (first, difference_s) in enumerate(zip(walk, ahead_s, strict=True)):
         if abs(difference_s) > _SAME_S:
@@ -157,44 +150,34 @@ def _on_missing(
 
 
 def _cameras(photographs: Sequence[AlbumPhotograph]) -> list[str]:
-    """Return the camera of each photograph, by maker and model, and of several of one model by its first photograph.
-
-    Serial numbers tell these apart, else how names begin, if times are apart as by clocks that differ.
-    """
+    """Return the camera of each photograph, by maker and model, and of several of one model by its first photograph."""
     of_model: defaultdict[str, list[int]] = defaultdict(list)
     for row, each in enumerate(photographs):
         of_model[" ".join(filter(None, (each.taken.make, each.taken.model))) or "an unknown camera"].append(row)
     cameras = [""] * len(photographs)
     for model, rows in of_model.items():
-        alike = [photographs[row] for row in rows]
-        bodies = [each.taken.body for each in alike]
-        keys = bodies if len(set(bodies)) > 1 else _beginnings(alike)
-        first = {key: each.name for key, each in zip(reversed(keys), reversed(alike), strict=True)}
-        for row, key in zip(rows, keys, strict=True):
-            cameras[row] = model if len(first) == 1 else f"{model} (of '{first[key]}')"
+        for row, first in zip(rows, _first_of_runs([photographs[row] for row in rows]), strict=True):
+            cameras[row] = f"{model} (of '{first}')" if first else model
     return cameras
 
 
-def _beginnings(photographs: Sequence[AlbumPhotograph]) -> list[str]:
-    """Return how the names of photographs begin, if those that begin alike are before or after the others."""
-    begins = [re.sub(r"\d.*", "", PurePath(each.name).stem.lower()) for each in photographs]
-    times: defaultdict[str, list[datetime]] = defaultdict(list)
-    for begin, each in zip(begins, photographs, strict=True):
-        times[begin] += [] if each.taken.at is None else [each.taken.at.replace(tzinfo=None)]
-    are_many = all(len(each) >= _MIN_PAIRS for each in times.values())
-    spans = sorted((min(each), max(each)) for each in times.values() if are_many)
-    is_apart = are_many and all(last < first for (_, last), (first, _) in pairwise(spans))
-    return begins if is_apart else [""] * len(begins)
+def _first_of_runs(photographs: Sequence[AlbumPhotograph]) -> list[str]:
+    """Return the first name of each photograph's run, which ends where times go back along names, or these change.
 
-
-def _goes_back(photographs: Sequence[AlbumPhotograph], seconds: Float[np.ndarray, "n"]) -> bool:
-    """Return whether times often go back along the numbers in names that are alike but for these."""
-    names = [PurePath(each.name).stem.lower() for each in photographs]
-    kinds = {re.sub(r"\d+", "#", name) for name in names}
-    if len(kinds) > 1 or "#" not in "".join(kinds):
-        return False
-    steps = np.diff(seconds[sorted(range(len(names)), key=lambda row: with_numbers(names[row]))])
-    return int((steps < -_SAME_S).sum()) >= max(_MIN_PAIRS, _BACK * len(steps))
+    Runs are of cameras of one model whose clocks differ if their times are apart; if not, the names are empty.
+    """
+    firsts, times, first, before = [""] * len(photographs), list[list[datetime]]([[]]), "", ""
+    for row in sorted(range(len(firsts)), key=lambda row: with_numbers(photographs[row].name)):
+        name, at = photographs[row].name, photographs[row].taken.at
+        at, begin = at and at.replace(tzinfo=None), re.sub(r"\d.*", "", PurePath(name).stem.lower())
+        if times[-1] and (begin != before or (at is not None and at < times[-1][-1])):
+            times.append([])
+        firsts[row] = first = first if times[-1] else name
+        times[-1] += [] if at is None else [at]
+        before = begin
+    spans = sorted((each[0], each[-1]) for each in times if len(each) >= _MIN_PAIRS)
+    is_apart = len(spans) == len(times) > 1 and all(last < first for (_, last), (first, _) in pairwise(spans))
+    return firsts if is_apart else [""] * len(firsts)
 
 
 def _seconds(
