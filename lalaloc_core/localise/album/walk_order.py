@@ -170,12 +170,12 @@ def _first_of_runs(photographs: Sequence[AlbumPhotograph]) -> list[str]:
     for row in sorted(range(len(firsts)), key=lambda row: with_numbers(photographs[row].name)):
         name, at = photographs[row].name, photographs[row].taken.at
         at, begin = at and at.replace(tzinfo=None), re.sub(r"\d.*", "", PurePath(name).stem.lower())
-        if times[-1] and (begin != before or (at is not None and at < times[-1][-1])):
+        if times[-1] and (begin != before or (at and (times[-1][-1] - at).total_seconds() > _SAME_S)):
             times.append([])
         firsts[row] = first = first if times[-1] else name
         times[-1] += [] if at is None else [at]
         before = begin
-    spans = sorted((each[0], each[-1]) for each in times if len(each) >= _MIN_PAIRS)
+    spans = sorted((min(each), max(each)) for each in times if len(each) >= _MIN_PAIRS)
     is_apart = len(spans) == len(times) > 1 and all(last < first for (_, last), (first, _) in pairwise(spans))
     return firsts if is_apart else [""] * len(firsts)
 
