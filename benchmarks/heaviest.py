@@ -461,6 +461,7 @@ _TOO_LONG = frozenset({422})
 _EMPTY_FORM = "multipart/form-data; boundary=b"
 # Statuses of bodies of too many events, and of bodies that do not arrive.
 _TOO_MANY_EVENTS, _TOO_LATE = frozenset({400}), frozenset({400, 408})
+_localising, _sequencing = (partial(Load, (f"POST /localise{path}",)) for path in ("", "/sequence"))
 LOADS = (
     _read("/floorplans", "pages of 500", 500, limit=None),
     _read(_PLAN),
@@ -498,31 +499,21 @@ LOADS = (
     Load((f"PUT {_VENUE}",), "{homes} homes", _put_venue),
     Load((f"PATCH {_VENUE}",), "{homes} homes, then a query in the venue", _change_and_search_venue),
     _read(f"{_VENUE}/plans", "{homes} homes, pages of 500", 500, limit=None),
-    Load(("POST /localise",), VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
-    Load(("POST /localise",), "{homes} homes", _localise(venue_id="{venue}"), connections=16),
-    Load(
-        ("POST /localise",),
-        "JPEG of 98 megapixels",
-        _localise(_jpeg, floorplan_id="{plan}", projection="equirectangular"),
-        98_000,
-    ),
-    Load(("POST /localise",), "JPEG of 400 scans", _localise(_scans, floorplan_id="{plan}"), 400, refusals=_TOO_LONG),
-    Load(
-        ("POST /localise",),
+    _localising(VERTICES_PLAN, _localise(floorplan_id="{plan}"), connections=16),
+    _localising("{homes} homes", _localise(venue_id="{venue}"), connections=16),
+    _localising("JPEG of 98 megapixels", _localise(_jpeg, floorplan_id="{plan}", projection="equirectangular"), 98_000),
+    _localising("JPEG of 400 scans", _localise(_scans, floorplan_id="{plan}"), 400, refusals=_TOO_LONG),
+    _localising(
         "JPEG of 5 million empty comments",
         _localise(_commented_picture, floorplan_id="{plan}"),
         5_000_000,
         refusals=_TOO_LONG,
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
-    Load(("POST /localise/sequence",), f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
-    Load(
-        ("POST /localise/sequence",), "18 photographs of a turn", _sequence(padded=False, photographs=18), connections=4
-    ),
-    Load(("POST /localise/sequence",), "10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
-    Load(
-        ("POST /localise/sequence",), "10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44
-    ),
+    _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
+    _sequencing("18 photographs of a turn", _sequence(padded=False, photographs=18), connections=4),
+    _sequencing("10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
+    _sequencing("10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44),
     Load(
         (*_SESSIONS, f"GET {_SESSION}", f"DELETE {_SESSION}"),
         f"two photographs, {ROOMS_PLAN}",
@@ -539,8 +530,8 @@ LOADS = (
     ),
     Load(("POST /albums",), "album of 500 spheres; beside it albums of 10", _pin_album, 500, beside_albums=True),
     Load((f"POST {_ALBUM}/copies",), f"10 spheres, {VERTICES_PLAN}", _copy_album),
-    Load(("POST /localise",), "body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
-    Load(("POST /localise",), "form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
+    _localising("body in chunks of 1 byte", _tiny_chunks, 200_000, refusals=_TOO_MANY_EVENTS),
+    _localising("form of 20,000 empty parts", _many_parts, 20_000, refusals=_TOO_MANY_EVENTS),
     Load(
         ("POST /floorplans",),
         "form of 500,000 lines that nearly end it",
@@ -548,7 +539,7 @@ LOADS = (
         500_000,
         refusals=_TOO_MANY_EVENTS | _TOO_LONG,
     ),
-    Load(("POST /localise",), "bodies that do not arrive", _partial_body, 100_000, connections=60, refusals=_TOO_LATE),
+    _localising("bodies that do not arrive", _partial_body, 100_000, connections=60, refusals=_TOO_LATE),
     Load((f"GET {_PLAN}/original",), "answers that are not read", _unread_answer, 2_048, connections=64),
     Load(("GET /model/{file}",), "encoder of spheres", _get("/model/image_encoder.onnx")),
     Load(

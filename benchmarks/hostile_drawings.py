@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Sequence
+from functools import partial
 
 from benchmarks.hostile_files import MODELS, PICTURES, Point, boxes, chords, circle, lattice, plan, rounded, star, stars
 from lalaloc_core.importers import ImportOptions
@@ -230,6 +231,7 @@ def _ifc_disks(size: int) -> bytes:
     return _ifc(*_IFC_BASE, "IFCSWEPTDISKSOLID(#14,0.1,$,$,$)", f"IFCPOLYLINE(({line}))", *places)
 
 
+_pdf_plan = partial(plan, "pdf", options=_POINTS)
 DRAWINGS = (
     plan("svg", "lines that cross", lambda s: _svg_lines(chords(s // 22))),
     plan("svg", "a lattice", lambda s: _svg_lines(lattice(s // 24))),
@@ -292,38 +294,27 @@ DRAWINGS = (
     plan("dxf", "an array of a block", _dxf_copies),
     plan("dxf", "format codes in a text", _dxf_text),
     plan("dxf", "numbers of 1e308", lambda s: _dxf("".join(_dxf_line((0, 0), (1e308, 1e308)) for _ in range(9)))),
-    plan("pdf", "lines that cross", lambda s: pdf(_pdf_lines(chords(s // 10, 700.0))), _POINTS),
-    plan("pdf", "a lattice", lambda s: pdf(_pdf_lines(lattice(s // 10, 700.0))), _POINTS),
-    plan(
-        "pdf",
+    _pdf_plan("lines that cross", lambda s: pdf(_pdf_lines(chords(s // 10, 700.0)))),
+    _pdf_plan("a lattice", lambda s: pdf(_pdf_lines(lattice(s // 10, 700.0)))),
+    _pdf_plan(
         "an outline that crosses itself",
         lambda s: pdf(b"0 0 m " + b"".join(b"%.2f %.2f l " % p for p in star(s // 8, 300.0)) + b"h f"),
-        _POINTS,
     ),
-    plan(
-        "pdf",
-        "ten million packed operators",
-        lambda s: pdf(b"0 0 m 9 9 l S " * 1_000_000 * max(s // 100_000, 1)),
-        _POINTS,
-    ),
-    plan("pdf", "fills of the whole page", lambda s: pdf(b"0 0 800 800 re f " * 290_000), _POINTS),
-    plan(
-        "pdf",
+    _pdf_plan("ten million packed operators", lambda s: pdf(b"0 0 m 9 9 l S " * 1_000_000 * max(s // 100_000, 1))),
+    _pdf_plan("fills of the whole page", lambda s: pdf(b"0 0 800 800 re f " * 290_000)),
+    _pdf_plan(
         "transparent fills",
         lambda s: pdf(b"/G gs " + b"0 0 800 800 re f " * 290_000, resources="/ExtGState<</G<</ca .3/BM/Multiply>>>>"),
-        _POINTS,
     ),
-    plan("pdf", "nested forms", _pdf_nested, _POINTS),
-    plan("pdf", "page of 14,400 points", lambda s: pdf(b"0 0 m 14400 14400 l S", 14400, 14400), _POINTS),
-    plan("pdf", "packed operators that draw nothing", lambda s: pdf(b"q Q " * 30_000_000), _POINTS),
-    plan(
-        "pdf",
+    _pdf_plan("nested forms", _pdf_nested),
+    _pdf_plan("page of 14,400 points", lambda s: pdf(b"0 0 m 14400 14400 l S", 14400, 14400)),
+    _pdf_plan("packed operators that draw nothing", lambda s: pdf(b"q Q " * 30_000_000)),
+    _pdf_plan(
         "texts",
         lambda s: pdf(
             b"BT /F 9 Tf " + b"1 0 0 1 9 9 Tm (bedroom) Tj " * 100_000 + b"ET",
             resources="/Font<</F<</Type/Font/Subtype/Type1/BaseFont/Helvetica>>>>",
         ),
-        _POINTS,
     ),
     plan("ifc", "a placement in itself", lambda _: _ifc_placed(7)),
     plan("ifc", "a chain of placements", _ifc_chain),

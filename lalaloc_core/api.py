@@ -372,7 +372,8 @@ def read_turn(
     sources, left_out = turn_files(Path(source)) if is_path else (source, [])
     if not 2 <= len(sources) <= MAX_TURN_PHOTOGRAPHS:
         where = f"'{source}'" if is_path else "the turn"
-        raise InvalidInputError(f"{where} has {len(sources)} photographs; a turn has 2 to {MAX_TURN_PHOTOGRAPHS}")
+        text = f"{where} has {len(sources)} photographs; a turn has 2 to {MAX_TURN_PHOTOGRAPHS}"
+        raise InvalidInputError("; ".join([text, *left_out]))
     opened = []
     for each in sources:
         with named(each):

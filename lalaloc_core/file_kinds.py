@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 _TABLE = tomllib.loads(Path(__file__).with_name("file_kinds.toml").read_text(encoding="utf-8"))
-HEIC, AVIF = _TABLE["heic"], _TABLE["avif"]
+HEIC, AVIF, VIDEO = _TABLE["heic"], _TABLE["avif"], _TABLE["video"]
 _MAGIC, _BRANDS = (
     {text.encode("latin-1"): kind for text, kind in _TABLE[name].items()} for name in ("magic", "brands")
 )
@@ -46,6 +46,9 @@ _MIN_FLAT_OF_SCANS, _MIN_PAPER_OF_SCANS, _MAX_STEP, _MIN_INK, _MAX_BETWEEN = 0.8
 _STROKE, _PAPER = 0.6, 0.88
 # Lines have many edges for their area, unlike dark furniture before a pale wall.
 _MIN_EDGES_OF_STROKES = 0.3
+# Photographs: edges relative to all that is darker than paper, of which there is so much, and no tone is frequent. Of
+# 348 views of 58 real rooms 97 % are within, of 188 plans, photographs and maps of them none that was not before.
+_MAX_SHARP, _MIN_TONED, _MAX_FREQUENT = 0.05, 0.03, 0.35
 # Step of the sample of a photograph; the smallest share of its most frequent tone in drawings, and in scans of tones
 # near the median.
 _SAMPLE, _MIN_SAMPLED, _NEAR, _MIN_NEAR = 4, 0.3, 45, 0.75
@@ -57,11 +60,11 @@ def describe_file(content: bytes) -> str | None:
     for magic, kind in _MAGIC.items():
         if content.startswith(magic):
             return kind
-    if content[:4] == b"RIFF" and content[8:12] == b"WEBP":
-        return "a WebP picture"
+    if content[:4] == b"RIFF":
+        return _BRANDS.get(content[8:12])
     if content[4:8] == b"ftyp":
         is_av1 = content[8:12] in _ANY_CODEC and b"av01" in content[:_HEAD_BYTES]
-        return AVIF if is_av1 else _BRANDS.get(content[8:12], "a video")
+        return AVIF if is_av1 else _BRANDS.get(content[8:12], VIDEO)
     head = content[:_HEAD_BYTES]
     if _HTML.match(head.removeprefix(b"\xef\xbb\xbf")):
         return _TABLE["page"]
@@ -138,12 +141,14 @@ class Tones:
 
     @property
     def is_photograph(self) -> bool:
-        """True for photographs of rooms and landscapes, and for no drawing; pale photographs give False.
+        """True for photographs of rooms and landscapes, and for no drawing; very pale photographs give False.
 
         Plans with coloured rooms or a dark site are as uneven, but have the lines and flat areas of `is_drawing`.
         """
         is_uneven = self.flat < _MAX_FLAT_OF_PHOTOGRAPHS and self.spread > _MIN_SPREAD_OF_PHOTOGRAPHS
-        return is_uneven and not self.is_drawing
+        toned = self.strokes + self.between
+        is_soft = self.edges < _MAX_SHARP * toned and toned > _MIN_TONED and self.uniform < _MAX_FREQUENT
+        return (is_uneven or is_soft) and not self.is_drawing
 
     @property
     def is_drawing(self) -> bool:

@@ -26,6 +26,8 @@ class ProblemKind:
 
 
 INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
+_INTERNAL = core.LaLaLocError, core.ConfigError, core.BundleError, core.CheckpointError, core.ExportError
+_INTERNAL += core.InvalidStateError, core.InvalidEntryError, core.DatasetError, core.RunError
 
 # Problem of each class of errors; classes of the service enter theirs when they are defined.
 PROBLEMS: dict[type[Exception], ProblemKind] = {
@@ -41,15 +43,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     core.InvalidHintError: ProblemKind(422, "invalid-hint", "Invalid hint"),
     core.InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
     core.InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
-    core.LaLaLocError: INTERNAL,
-    core.ConfigError: INTERNAL,
-    core.BundleError: INTERNAL,
-    core.CheckpointError: INTERNAL,
-    core.ExportError: INTERNAL,
-    core.InvalidStateError: INTERNAL,
-    core.InvalidEntryError: INTERNAL,
-    core.DatasetError: INTERNAL,
-    core.RunError: INTERNAL,
+    **dict.fromkeys(_INTERNAL, INTERNAL),
 }
 
 # Errors of the framework, such as an unknown route.
@@ -206,7 +200,10 @@ class UnmeasuredModelError(ServiceError, problem=(501, "model-unmeasured", "Mode
 
 
 class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Upload too large")):
-    message = "the body {}; the limit is {} bytes (LALALOC_{})"
+    message = (
+        "the body {}; the limit is {} bytes (LALALOC_{}): send fewer files at once, photographs as JPEG, whose longer "
+        "side needs 4000 pixels at most, or a film of one turn in Full HD"
+    )
 
     def __init__(self, setting: str, limit: int, stated: int | None = None) -> None:
         super().__init__("is too large" if stated is None else f"has {stated} bytes", limit, setting.upper())

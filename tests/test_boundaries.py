@@ -82,20 +82,11 @@ LAYERS |= {
     for name in names.split()
 }
 # Only these packages load torch when imported.
-TORCH_PACKAGES = (
-    "lalaloc_core.nets",
-    "lalaloc_core.localise.refine.latent_refiner",
-    "lalaloc_core.learn.synth",
-    "lalaloc_core.learn.data.synthetic",
-    "lalaloc_core.learn.training",
-    "lalaloc_core.learn.export",
-    "lalaloc_core.evaluate.calibrate",
-    "lalaloc_core.evaluate.methods",
-    "lalaloc_core.evaluate.runs",
-    "lalaloc_core.evaluate.report",
-    "lalaloc_core.evaluate.reproduce",
-    "lalaloc_core.evaluate.bench",
+_WITH_TORCH = (
+    "nets localise.refine.latent_refiner learn.synth learn.data.synthetic learn.training learn.export "
+    "evaluate.calibrate evaluate.methods evaluate.runs evaluate.report evaluate.reproduce evaluate.bench"
 )
+TORCH_PACKAGES = tuple(f"lalaloc_core.{name}" for name in _WITH_TORCH.split())
 OURS = ("lalaloc_core", "service", "lalaloc_client")
 
 

@@ -28,7 +28,10 @@ _FISHEYES = [(re.compile(pattern, re.I), angle_deg) for pattern, angle_deg in _C
 # Longer equivalent focal lengths of these cameras are those of linear and narrow modes.
 _MAX_FISHEYE_MM = 18.0
 # A crop that Lightroom, unless the pixels do not have it yet, or darktable states.
-_HAS_CROP = re.compile(rb":HasCrop(?:=.|>)\s{0,9}[Tt]rue|:operation=.(?:crop|clipping).[^<>]{1,99}enabled=.1")
+_HAS_CROP = re.compile(
+    rb":HasCrop(?:=.|>)\s{0,9}[Tt]rue|:Crop(?:Left|Top)(?:=.|>)\s{0,9}0\.0{0,9}[1-9]|"
+    rb":operation=.(?:crop|clipping).[^<>]{1,99}enabled=.1"
+)
 _NOT_APPLIED = re.compile(rb":AlreadyApplied\s{0,9}(?:=\s{0,9}.|>)\s{0,9}[Ff]alse")
 _SIZES = re.compile(rb"tiff:Image(Width|Length)\s{0,9}(?:=\s{0,9}.|>)\s{0,9}(\d{1,6})")
 # Editors, after which a picture can be a part of what its focal length is for.
@@ -219,6 +222,7 @@ def read_taken(exif: Image.Exif, packets: Sequence[bytes], *, width: int, height
     tags = exif.get_ifd(ExifTags.IFD.Exif)
     # The time of the file's last change is not used.
     texts = [[_text(tags.get(tag)) for tag in names] for names in _TIMES]
+    texts = [[at, digits, zone or _text(tags.get(ExifTags.Base.OffsetTime))] for at, digits, zone in texts]
     stated = sorted(found for packet in packets for found in _XMP_TIME.findall(packet))
     texts += [[text.decode(errors="replace").strip()] for _, text in stated]
     at = next(filter(None, (read_time(*text) for text in texts)), None) or _time_of_gps(exif)

@@ -69,22 +69,22 @@ def count_scans(content: bytes, limit: int) -> int:
     return sum(1 for _ in islice(scans, limit + 1))
 
 
-def check_segments(content: bytes) -> None:
-    """Refuse a JPEG or PNG with too many segments, before the first scan, or chunks; other files pass."""
+def check_segments(content: bytes, max_scans: int) -> None:
+    """Refuse a JPEG or PNG with too many segments, before the first scan, scans or chunks; other files pass."""
     kind, counts = "JPEG", list[tuple[int, int, str]]()
     if content.startswith(START):
         head = takewhile(lambda found: found[0] != START_OF_SCAN, markers(content))
         segments = list(islice(head, _MAX_SEGMENTS + 1))
         exif = sum(marker == APP1 and content.startswith(b"Exif\0\0", place + 2) for marker, place in segments)
-        counts = [(exif, _MAX_EXIF_SEGMENTS, "Exif segments"), (len(segments), _MAX_SEGMENTS, "segments")]
+        counts = [(exif, _MAX_EXIF_SEGMENTS, "Exif segments, the limit")]
+        counts += [(len(segments), _MAX_SEGMENTS, "segments, the limit")]
+        counts += [(count_scans(content, max_scans), max_scans, "scans, the limit (max_scans)")]
     elif content.startswith(_PNG):
         kind, chunks = "PNG", sum(1 for _ in islice(png_chunks(content), _MAX_CHUNKS + 1))
-        counts = [(chunks, _MAX_CHUNKS, "chunks")]
+        counts = [(chunks, _MAX_CHUNKS, "chunks, the limit")]
     for count, limit, parts in counts:
         if count > limit:
-            raise InvalidPhotographError(
-                f"the photograph is a {kind} with more than {limit} {parts}, the limit; save it again"
-            )
+            raise InvalidPhotographError(f"the photograph is a {kind} with more than {limit} {parts}; save it again")
 
 
 def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:

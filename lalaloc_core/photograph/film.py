@@ -24,9 +24,10 @@ from jaxtyping import UInt8
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import InvalidFilmError
+from lalaloc_core.file_kinds import VIDEO, describe_file
 from lalaloc_core.photograph.exif import ExifLens, fisheye_of
 from lalaloc_core.photograph.film_motion import FlowTracker
-from lalaloc_core.photograph.overlap import LIKELY_SD, Step
+from lalaloc_core.photograph.overlap import LIKELY_SD, Step, shrunk
 from lalaloc_core.photograph.patches import PatchSize
 from lalaloc_core.photograph.photo_sphere import PhotoSphere
 from lalaloc_core.photograph.photograph import Photograph, photograph_of_picture
@@ -102,6 +103,8 @@ class _Samples:
     inside: tuple[slice, slice] = _WHOLE
     looks: list[UInt8[np.ndarray, "h w 3"]] = field(default_factory=list)
     is_barred: bool = False
+    first: UInt8[np.ndarray, "h w 3"] | None = None
+    changes: bool = False
     best: dict[int, _Sample] = field(default_factory=dict)
     dropped: Counter[str] = field(default_factory=Counter)
     frames: int = 0
@@ -299,7 +302,9 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
             if samples.stored_size != frame.shape[1::-1]:
                 samples.dropped["of another size"] += 1
                 continue
-            picture = _shrunk(frame[samples.inside], _LONG_SIDE)
+            picture = shrunk(frame[samples.inside], _LONG_SIDE)
+            samples.first = picture if samples.first is None else samples.first
+            samples.changes = samples.changes or not np.array_equal(samples.first, picture)
             # A sample is followed while the next one is decoded, where there is a core for it.
             if followed is not None:
                 followed.result()
@@ -312,6 +317,12 @@ def _sample_film(content: bytes, tracker: FlowTracker, samples: _Samples, limits
             followed.result()
     if not samples.frames:
         raise InvalidFilmError("no frame of the film can be decoded: it is damaged, or has no pictures; save it anew")
+    if not samples.changes:
+        # FFmpeg gives the same frame, of any content, for each one of an interlaced film.
+        raise InvalidFilmError(
+            f"all {samples.frames} frames of the film are the same: film one slow turn in a lit room, and send a "
+            "picture as a photograph; export an interlaced film, as of a camcorder, as progressive"
+        )
 
 
 def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Samples, tracker: FlowTracker) -> None:
@@ -320,7 +331,7 @@ def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Sample
         samples.dropped["dark"] += 1
         return
     if samples.inside == _WHOLE and tracker.number % _LOOKED_AT == 0:
-        samples.looks.append(_shrunk(picture, THUMBNAIL_SIDE))
+        samples.looks.append(shrunk(picture, THUMBNAIL_SIDE))
         # A film with bars is read once more, within them.
         samples.is_barred = len(samples.looks) == _FIRST_LOOKS and _inside_bars(samples) != _WHOLE
     heading = tracker.follow(grey)
@@ -328,11 +339,6 @@ def _sample(picture: UInt8[np.ndarray, "h w 3"], time_s: float, samples: _Sample
     samples.add(
         _Sample(time_s, tracker.number, heading, sharpness, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), tracker.step
     )
-
-
-def _shrunk(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarray, "h2 w2 3"]:
-    share = min(long_side / max(picture.shape), 1.0)
-    return cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else picture
 
 
 def _inside_bars(samples: _Samples) -> tuple[slice, slice]:
@@ -354,8 +360,8 @@ def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCaptu
     kind = film_kind(content)
     if kind is None:
         raise InvalidFilmError(
-            "the file is no MP4, MOV, WebM or Matroska film by its first bytes; record or export the film in one of "
-            "these formats"
+            f"the film is {describe_file(content) or 'another file'} by its first bytes, not MP4, MOV, WebM or "
+            "Matroska: record or export it in one of these formats, and send pictures as photographs"
         )
     before = os.environ.get(_OPTIONS)
     # No protocol: everything is in memory. FFmpeg would otherwise choose among all of its demuxers by the content.
@@ -379,7 +385,7 @@ def _opened(content: bytes, limits: FilmLimits) -> Iterator[tuple[cv2.VideoCaptu
 
 def film_kind(content: bytes) -> str | None:
     """Return the kind of a film by its first bytes: a key of `_DEMUXERS`; None for other files."""
-    if content[4:8] in _BOXES:
+    if content[4:8] in _BOXES and describe_file(content) in (None, VIDEO):
         return "MP4 or MOV"
     if content[:4] == _EBML and any(name in content[4:_HEAD] for name in _DOC_TYPES):
         return "WebM or Matroska"

@@ -86,12 +86,15 @@ class Link:
     turn: float
 
 
+def shrunk(picture: UInt8[np.ndarray, "h w *c"], long_side: int) -> UInt8[np.ndarray, "k l *c"]:
+    """Return a picture with a longer side of so many pixels, if it has more."""
+    share = min(long_side / max(picture.shape), 1.0)
+    return cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA) if share < 1.0 else picture
+
+
 def find_features(picture: UInt8[np.ndarray, "h w 3"], long_side: int) -> Features:
     """Return the features of a picture, spread over it, that are found at a longer side (pixels)."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    share = long_side / max(grey.shape)
-    if share < 1.0:
-        grey = cv2.resize(grey, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
+    grey = shrunk(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), long_side)
     found, descriptor = cv2.SIFT.create(nfeatures=4 * _MAX_FEATURES, contrastThreshold=_CONTRAST).detectAndCompute(
         grey, None
     )

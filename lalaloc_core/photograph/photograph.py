@@ -30,7 +30,7 @@ from lalaloc_core.photograph.levelling import (
     find_segments,
     lines_of,
 )
-from lalaloc_core.photograph.overlap import find_features
+from lalaloc_core.photograph.overlap import find_features, shrunk
 from lalaloc_core.photograph.patches import FINER, Patch, PatchSize, cut_patches, reduced, seen_azimuths, thumbnail_of
 from lalaloc_core.photograph.photo_sphere import PhotoSphere, read_photo_sphere
 from lalaloc_core.photograph.picture_files import FORMATS, PhotographLimits, PictureFile, opened_picture, scaled
@@ -55,6 +55,8 @@ _USUAL_RATIOS, _USUAL_TOLERANCE = (4.0 / 3.0, 1.5, 16.0 / 9.0), 0.02
 # Log ratio by which lines, and twice their deviation, contradict the focal length of an edited picture: in 2 % of 848
 # views of real rooms, and in 88 % (65 %) of these cropped to 0.5 (0.7) of their sides.
 _NARROWER = 0.2
+# Mean brightness (of 255) of photographs that are too dark.
+_DARK = 12.0
 # Standard deviation of a stated pitch or roll.
 _GIVEN_SD = math.radians(0.5)
 
@@ -206,9 +208,12 @@ def open_photograph(
             raise InvalidPhotographError(found.text)
         else:
             lens = opened.lens()
-        named = () if found is None else (found.text,)
-        lens = replace(lens, warnings=(*named, *file.warnings, *opened.metadata.warnings, *lens.warnings))
         pixels = opened.sphere if lens.is_sphere else opened.picture(lens.camera, size)
+        named = () if found is None else (found.text,)
+        light = max(cv2.mean(pixels))
+        if light < _DARK:
+            named += (f"the photograph is dark, {light:.0f} of 255 on average, below {_DARK:g}: take it in a lit room",)
+        lens = replace(lens, warnings=(*named, *file.warnings, *opened.metadata.warnings, *lens.warnings))
     if refuse_drawings and is_drawing(pixels):
         raise InvalidPhotographError(
             "the picture is a drawing or a page of text, not a photograph: upload a plan as a floor plan, and send a "
@@ -218,8 +223,9 @@ def open_photograph(
         photograph = _photograph_of_sphere(pixels, lens, stated, opened.metadata)
     else:
         photograph = photograph_of_picture(pixels, (opened.width, opened.height), lens, stated, size, purpose)
-    # Software without a sensor states an orientation, too, but no camera.
-    is_upright = photograph.is_upright or (bool(taken.make) and ExifTags.Base.Orientation in file.exif)
+    # Software without a sensor states an orientation, too, but no camera; and editors turn pictures.
+    is_by_camera = bool(taken.make) and not opened.exif.is_doubtful and ExifTags.Base.Orientation in file.exif
+    is_upright = photograph.is_upright or is_by_camera
     return replace(photograph, taken=taken, is_upright=is_upright)
 
 
@@ -283,10 +289,7 @@ class _Opened:
         is_plain = orientation == 1 and self.width == 2 * self.height and self.metadata.level
         is_fine = self.sphere_size[0] >= COARSEST[0]
         picture = self.sphere if is_plain and is_fine else self.picture(None, PatchSize())
-        share = min((COARSEST[1] if is_plain else THUMBNAIL_SIDE) / max(picture.shape), 1.0)
-        if share < 1.0:
-            size = (max(1, round(share * side)) for side in (picture.shape[1], picture.shape[0]))
-            picture = cv2.resize(picture, tuple(size), interpolation=cv2.INTER_AREA)
+        picture = shrunk(picture, COARSEST[1] if is_plain else THUMBNAIL_SIDE)
         return Thumbnail(picture, orientation)
 
     def sphere_format(self) -> SphereFormat | None:
@@ -424,7 +427,7 @@ def field_warning(hfov: float, sd: float, origin: str) -> str:
     """Return the warning that a field of view (radians) is not known."""
     return (
         f"the field of view of {math.degrees(hfov):.0f}° ± {math.degrees(2.0 * sd):.0f}° {origin}; "
-        "send hfov_deg or the camera's original file"
+        "send hfov_deg, or send the camera's original file"
     )
 
 

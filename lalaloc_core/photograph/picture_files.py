@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -25,14 +26,13 @@ from lalaloc_core.photograph.file_segments import (
     END,
     MAX_TEXT_BYTES,
     check_segments,
-    count_scans,
     lacks_end,
     without_large_texts,
     xmp_packets,
 )
 
 FORMATS = ("JPEG", "PNG", "WEBP")
-_SUPPORTED = "JPEG, PNG or WEBP"
+_SUPPORTED = "JPEG, PNG or WebP"
 # Colour of missing parts of the sphere: the mean that encoders subtract.
 NEUTRAL = (128, 128, 128)
 # Pictures with more pixels are scaled down in bands of about this size.
@@ -47,6 +47,7 @@ _UPRIGHT = {
     8: Image.Transpose.ROTATE_90,
 }
 SIDEWAYS = {5, 6, 7, 8}
+_FRONT = re.compile(r"\bfront\b", re.IGNORECASE)
 _WHOLE = 0.0, 0.0, 1.0, 1.0
 # Ratios of sides that differ by less (relative) are of one picture.
 _SAME_RATIO = 0.01
@@ -115,13 +116,12 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Picture
     if not content:
         raise InvalidPhotographError("the photograph is empty; if it is still in a cloud, download it first")
     _check_webp_size(content, limits)
-    check_segments(content)
+    check_segments(content, limits.max_scans)
     is_cut = lacks_end(content)
     # Without its end, the decoder refuses all of the picture.
     readable, left_out = (content + END, 0) if is_cut else without_large_texts(content)
     with _named_errors(content, limits), Image.open(io.BytesIO(readable), formats=_formats(content)) as image:
         _check_pixels(*image.size, limits)
-        _check_scans(content, limits)
         yield _file_of(image, content, readable, left_out)
 
 
@@ -147,7 +147,10 @@ def _file_of(image: Image.Image, content: bytes, readable: bytes, left_out: int)
     is_untold = unused != 1 and b"irot" not in content and b"imir" not in content
     if is_untold:
         exif.pop(ExifTags.Base.Orientation, None)
+    lens = str(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.LensModel, ""))
     faults = {
+        f"the photograph is of a front camera (Exif LensModel '{lens[:60]}'), which can save it mirrored: check that "
+        "texts in it can be read, else mirror it": _FRONT.search(lens) is not None and lens.isprintable(),
         f"the Exif orientation {orientation} was ignored, because the picture was turned after it was taken: the Exif "
         "size is that of a picture on its side; send the camera's original file if this is wrong": was_turned,
         f"the Exif orientation {unused} was ignored, as HEIC pictures state their turn otherwise, and this one states "
@@ -306,8 +309,10 @@ def _named_errors(content: bytes, limits: PhotographLimits) -> Iterator[None]:
                 "whole file"
             ) from error
         kind = describe_file(content) or "a picture"
+        # The decoder refuses more pixels than remain.
+        fault = "cut to a part without being coded anew" if kind == HEIC and b"clap" in content else "damaged"
         raise InvalidPhotographError(
-            f"the photograph is {kind} that is damaged, or coded in a way that is not supported; save or export it as "
+            f"the photograph is {kind} that is {fault}, or coded in a way that is not supported; save or export it as "
             f"{_SUPPORTED}"
         ) from error
 
@@ -319,7 +324,7 @@ def _unreadable(content: bytes) -> str:
     if kind == HEIC:
         return f"the photograph is {kind}, which is damaged; save or export it as {_SUPPORTED}"
     if kind is None or kind.removeprefix("a ").removesuffix(" picture").upper() in FORMATS:
-        return f"the photograph is not a readable {_SUPPORTED} or HEIC picture"
+        return f"the photograph is not a readable JPEG, PNG, WebP or HEIC picture; save or export it as {_SUPPORTED}"
     return f"the photograph is {kind}, which is not supported; save or export it as {_SUPPORTED}"
 
 
@@ -343,12 +348,4 @@ def _check_pixels(width: int, height: int, limits: PhotographLimits) -> None:
         raise InvalidPhotographError(
             f"the photograph has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
             "(max_pixels)"
-        )
-
-
-def _check_scans(content: bytes, limits: PhotographLimits) -> None:
-    """Refuse JPEGs with many scans; each visits all pixels again."""
-    if count_scans(content, limits.max_scans) > limits.max_scans:
-        raise InvalidPhotographError(
-            f"the photograph is a JPEG with more than {limits.max_scans} scans, the limit (max_scans); save it again"
         )

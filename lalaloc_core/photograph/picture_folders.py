@@ -19,17 +19,21 @@ PICTURES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".heic", ".heif", ".insp
 
 
 def turn_files(folder: Path) -> tuple[list[Path], list[str]]:
-    """Return the photographs of a turn in a folder, and lines on what is left out: empty, hidden and other files.
+    """Return the photographs of a turn in a folder, and lines on their order and on empty, hidden and other files.
 
     They are in the order of their times, if all have different ones, else in that of the numbers in their names.
     """
     files = pictures_in(folder, require=False)
     used = [file for file in files if file.stat().st_size]
     times = {file: _taken_at(file) for file in used} if len(used) <= MAX_TURN_PHOTOGRAPHS else {}
-    if times and None not in times.values() and len(set(times.values())) == len(used):
+    notes, untimed = [f"'{file.name}' is empty and was left out" for file in files if file not in used], len(used)
+    untimed -= len({time for time in times.values() if time is not None})
+    if not untimed:
         used.sort(key=lambda file: times[file] or 0.0)
-    empty = [f"'{file.name}' is empty and was left out" for file in files if not file.stat().st_size]
-    return used, empty + left_out(folder, files)
+    elif untimed < len(used):
+        text = "have no time of their own, so all are in the order of the numbers in their names: check it"
+        notes.append(f"{untimed} of {len(used)} photographs {text}")
+    return used, notes + left_out(folder, files)
 
 
 def left_out(folder: Path, used: Iterable[Path]) -> list[str]:

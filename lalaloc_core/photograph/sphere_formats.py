@@ -116,6 +116,12 @@ def _has_ratio(pixels: np.ndarray, ratio: float) -> bool:
     return abs(width - ratio * height) <= max(_TOLERANCE * width, 1.0 + ratio)
 
 
+def _halves(picture: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the halves of a picture, above one another (axis 0) or beside each other."""
+    half = picture.shape[axis] // 2
+    return (picture[:half], picture[-half:]) if axis == 0 else (picture[:, :half], picture[:, -half:])
+
+
 def _find_sideways(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a sphere that the Exif orientation would turn on its side."""
     if thumbnail.orientation not in (5, 6, 7, 8) or not _has_ratio(thumbnail.pixels, 0.5):
@@ -135,11 +141,8 @@ def _find_circles(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a picture with one or two circles of fisheye lenses on black."""
     grey = thumbnail.grey
     height, width = grey.shape
-    for ratio, halves in (
-        (2.0, (grey[:, : width // 2], grey[:, width - width // 2 :])),
-        (0.5, (grey[: height // 2], grey[height - height // 2 :])),
-    ):
-        if _has_ratio(grey, ratio) and all(map(_is_circle, halves)):
+    for ratio, axis in ((2.0, 1), (0.5, 0)):
+        if _has_ratio(grey, ratio) and all(map(_is_circle, _halves(grey, axis))):
             return SphereFormat(
                 text="the photograph is the dual fisheye picture of a 360° camera, two circles that are not stitched: "
                 "export it from the camera's app as an equirectangular 360° photograph"
@@ -178,20 +181,12 @@ def _circle_parts() -> tuple[Bool[np.ndarray, "s s"], Int[np.ndarray, "s s"]]:
 def _find_stereo(thumbnail: Thumbnail) -> SphereFormat | None:
     """Return the format of a picture with two eyes, each with a sphere or with 180° of it."""
     pixels = thumbnail.pixels
-    height, width = pixels.shape[:2]
-    above = (slice(height // 2), slice(None)), (slice(height - height // 2, height), slice(None))
-    beside = (slice(None), slice(width // 2)), (slice(None), slice(width - width // 2, width))
     # Made small once for both ways, as that takes longest.
-    down, across = 2 * _EYE[0], 2 * _EYE[1]
-    small = cv2.resize(thumbnail.grey, (across, down), interpolation=cv2.INTER_AREA)
-    eyes_above, eyes_beside = (
-        (small[: down // 2], small[down // 2 :]),
-        (small[:, : across // 2], small[:, across // 2 :]),
-    )
-    for name, (first, second), eyes in (("above", above, eyes_above), ("beside", beside, eyes_beside)):
-        if not _look_alike(*eyes):
+    small = cv2.resize(thumbnail.grey, (2 * _EYE[1], 2 * _EYE[0]), interpolation=cv2.INTER_AREA)
+    for axis, name in enumerate(("above", "beside")):
+        if not _look_alike(*_halves(small, axis)):
             continue
-        if looks_spherical(pixels[first]) and looks_spherical(pixels[second]):
+        if all(map(looks_spherical, _halves(pixels, axis))):
             return SphereFormat(
                 text=f"the photograph is a stereo sphere, one eye {name} the other: cut out one of them, and send it "
                 "as a picture twice as wide as high"

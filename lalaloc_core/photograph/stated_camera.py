@@ -195,11 +195,11 @@ def fit_intrinsics(stated: Intrinsics, width: int, height: int, orientation: int
     if max(abs(x / width - 0.5), abs(y / height - 0.5)) <= _FAR or min(x, y) <= 0.0:
         return stated, ()
     if abs(x / width / (y / height) - 1.0) <= _EXACT:
-        return _scaled(stated, width, height, named)
+        return _scaled(stated, (x, y), width, height, named)
     # Of the stored picture, whose width is the height of the upright one.
     is_size = max(abs(x / height - 0.5), abs(y / width - 0.5)) <= _NEAR
     if is_size or abs(x / height / (y / width) - 1.0) <= _EXACT:
-        at_size, scaling = (stated, ()) if is_size else _scaled(stated, height, width, named)
+        at_size, scaling = (stated, ()) if is_size else _scaled(stated, (x, y), height, width, named)
         text = (
             f"{named}, the middle of a picture on its side, not of the upright one of {width} x {height}: the "
             "intrinsics were turned with it"
@@ -223,11 +223,11 @@ def compare_focal_lengths(stated: float, by_exif: float | None, width: int) -> t
     )
 
 
-def _scaled(stated: Intrinsics, width: int, height: int, named: str) -> tuple[Intrinsics, tuple[str, ...]]:
+def _scaled(
+    stated: Intrinsics, centre: tuple[float, float], width: int, height: int, named: str
+) -> tuple[Intrinsics, tuple[str, ...]]:
     """Return the intrinsics scaled to a picture in whose middle the principal point is."""
-    assert stated.cx is not None
-    assert stated.cy is not None
-    x, y = stated.cx + HALF_PIXEL, stated.cy + HALF_PIXEL
+    x, y = centre
     scale = 0.5 * math.sqrt(width * height / (x * y))
     fitted = replace(
         stated, fx=stated.fx * scale, fy=stated.fy * scale, cx=x * scale - HALF_PIXEL, cy=y * scale - HALF_PIXEL

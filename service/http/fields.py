@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from fastapi import Request
@@ -25,25 +27,7 @@ def _number(value: object) -> str:
 
 
 # Messages by pydantic's error type; other types keep pydantic's message.
-_WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    "float_parsing": lambda _: "not a number",
-    "float_type": lambda _: "not a number",
-    "int_parsing": lambda _: "not a whole number",
-    "int_type": lambda _: "not a whole number",
-    "int_from_float": lambda _: "not a whole number",
-    "int_parsing_size": lambda _: "too many digits",
-    "bool_parsing": lambda _: "must be true or false",
-    "finite_number": lambda _: "must be finite",
-    "greater_than_equal": lambda context: f"must be at least {_number(context['ge'])}",
-    "greater_than": lambda context: f"must be more than {_number(context['gt'])}",
-    "less_than_equal": lambda context: f"must be at most {_number(context['le'])}",
-    "less_than": lambda context: f"must be less than {_number(context['lt'])}",
-    "literal_error": lambda context: f"must be {context['expected']}",
-    "string_too_short": lambda context: f"must have at least {context['min_length']} characters",
-    "string_too_long": lambda context: f"must have at most {context['max_length']} characters",
-    "string_pattern_mismatch": lambda _: "has characters that are not allowed",
-    "value_error": lambda context: str(context["error"]),
-}
+_WORDS = tomllib.loads(Path(__file__).with_name("fault_words.toml").read_text(encoding="utf-8"))
 
 
 def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
@@ -58,7 +42,9 @@ def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
     if kind in ("too_short", "too_long"):
         limit = context.get("min_length", context.get("max_length"))
         return field, f"is given {context.get('actual_length')} times, {limit} are needed"
-    words = _WORDS[kind](context) if kind in _WORDS else str(fault.get("msg", "invalid"))
+    words = str(fault.get("msg", "invalid"))
+    if kind in _WORDS:
+        words = _WORDS[kind].format(**{name: _number(value) for name, value in context.items()})
     value = fault.get("input")
     shown = f"is '{str(value)[:_MAX_SHOWN]}': " if isinstance(value, str | int | float) else ""
     return field, shown + words

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -26,6 +27,7 @@ from service.capacity.fair_share import FairSemaphore
 from service.capacity.threads import Threads
 from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
+from service.query.grounds import spread
 from service.query.queries import AlbumEntry, AlbumOutcome, AlbumPhotographQuery, AlbumQuery, Where
 from service.query.single_query import QueryParts
 from service.schemas.albums import AlbumDocument, PhotographFacts
@@ -38,8 +40,6 @@ AT_A_TIME = 4
 _MEMORY_BYTES = 256 * 2**20
 # CPU time (s) of an album until it is solved, in all its turns; the largest ones need some minutes.
 _MAX_CPU_S = 3600.0
-# Photographs that the plans of a large venue are chosen by.
-_CHOOSING = 8
 
 
 class _Stopped(Exception):
@@ -61,7 +61,11 @@ class AlbumSearch:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):
-            view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
+            try:
+                view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
+            except InvalidPhotographError as error:
+                raise InvalidPhotographError(_in_album(str(error))) from error
+            view = replace(view, warnings=tuple(map(_in_album, view.warnings)))
         if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
             raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
 
@@ -91,7 +95,7 @@ class AlbumSearch:
             await site.wait(context)
             chosen: list[Query] = []
             if isinstance(where, VenueRecord):
-                spots = [Spot(entry.photograph) for entry in _spread(photographs)]
+                spots = [Spot(entry.photograph) for entry in spread(photographs)]
                 known, heights = [UNKNOWN_HEADING] * len(spots), [site.height] * len(spots)
                 chosen = await self._parts.reader.encode(spots, known, heights, context)
             ground = await site.ground(chosen, context)
@@ -163,11 +167,6 @@ def _size_of(memory: AlbumMemory) -> int:
     )
 
 
-def _spread(photographs: Sequence[AlbumPhotograph]) -> list[AlbumPhotograph]:
-    step = max(len(photographs) // _CHOOSING, 1)
-    return list(photographs[::step][:_CHOOSING])
-
-
 def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
     """Return the ground for the core; a stated camera height takes the place of the plans' own."""
 
@@ -182,6 +181,11 @@ def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
     ids = tuple(record.id for record in ground.records)
     merged = ground.merged or MergedPlans.of_plan(ground.plan, ground.grid)
     return AlbumGround(ids, replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan)))
+
+
+def _in_album(text: str) -> str:
+    """Return an advice about a photograph for albums, whose camera is stated when they are created."""
+    return re.sub(r"\bsend (?=projection|hfov_deg|intrinsics)", "create an album with ", text)
 
 
 def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Sequence
 from functools import partial
 from time import monotonic
+from typing import TypeVar
 
 import numpy as np
 
@@ -31,8 +32,9 @@ from service.venues.venue_hints import VenueHints
 from service.venues.venue_plans import VenuePlans, venue_height
 from service.venues.venue_search import Favour, VenueSearch
 
-# Photographs of a sequence that plans are chosen by.
+# Photographs of a sequence or an album that plans are chosen by.
 _CHOOSING = 8
+_Item = TypeVar("_Item")
 
 
 class Grounds:
@@ -170,7 +172,7 @@ class VenueSite:
         `favour` returns log factors by which plans are preferred in the choice alone. See `VenueSearch.load` for the
         errors.
         """
-        choosing = _spread(encoded)
+        choosing = spread(encoded)
         with context.clock.stage("shortlist"):
             loaded = await self._grounds.search.load(
                 self._where.tenant,
@@ -193,10 +195,10 @@ class VenueSite:
 Site = PlanSite | VenueSite
 
 
-def _spread(encoded: Sequence[Query]) -> list[Query]:
+def spread(photographs: Sequence[_Item]) -> list[_Item]:
     """Return photographs at even intervals, few enough to choose plans by each."""
-    index = np.unique(np.linspace(0, len(encoded) - 1, _CHOOSING).round().astype(int))
-    return [encoded[int(number)] for number in index]
+    index = np.unique(np.linspace(0, len(photographs) - 1, _CHOOSING).round().astype(int))
+    return [photographs[int(number)] for number in index]
 
 
 def stated_height(form: HeightFields, record: PlanRecord) -> CameraHeight:

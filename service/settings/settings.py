@@ -34,19 +34,11 @@ _PHOTOGRAPHS_PER_LIMIT = 10
 FILM_PHOTOGRAPHS = 40
 
 # Settings of earlier versions, besides those that are constants now. A variable of one is ignored with a warning.
-_REMOVED = frozenset(
-    {
-        "decode_queue",
-        "head_deadline_s",
-        "import_deadline_s",
-        "import_queue",
-        "import_stall_s",
-        "max_grids_per_plan",
-        "plan_cache_age_s",
-        "refused_keys_per_minute",
-        "stream_deadline_s",
-    }
+_REMOVED_NAMES = (
+    "decode_queue head_deadline_s import_deadline_s import_queue import_stall_s max_grids_per_plan plan_cache_age_s "
+    "refused_keys_per_minute stream_deadline_s"
 )
+_REMOVED = frozenset(_REMOVED_NAMES.split())
 
 
 # Earlier names of settings, which stay valid.

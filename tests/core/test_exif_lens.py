@@ -100,6 +100,7 @@ def test_picture_cropped_later_has_no_focal_length() -> None:
     ("packet", "is_cropped"),
     [
         (b"<x ns1:HasCrop='True'/>", True),
+        (b"<x crs:CropTop='0.000' crs:CropLeft='0.25'/>", True),
         (b'<x crs:HasCrop="True" crs:AlreadyApplied="False"/>', False),
         (b'<x tiff:ImageWidth="4032" tiff:ImageLength="2268"/>', True),
         (b'<li darktable:operation="crop" darktable:enabled="1"/>', True),

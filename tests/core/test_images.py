@@ -192,12 +192,6 @@ class TestScans:
         assert count_scans(of_scans(256, 128, added), 100) == 6 + added
         assert read(of_scans(256, 128, added)).shape == (HEIGHT, WIDTH, 3)
 
-    def test_scan_limit_is_inclusive(self) -> None:
-        limits = PhotographLimits(max_scans=8)
-        read(of_scans(256, 128, 2), limits)
-        with pytest.raises(InvalidPhotographError, match=r"more than 8 scans"):
-            read(of_scans(256, 128, 3), limits)
-
     @pytest.mark.slow
     @pytest.mark.parametrize("unit", [b"\xff\x00", b"\xff\xff", b"\xff\xd0", b"\xff\x01", b"\xff\xe0\0\2", b"\0"])
     def test_scan_count_takes_linear_time(self, unit: bytes) -> None:
@@ -246,18 +240,13 @@ class TestRefused:
             read(content)
 
     @pytest.mark.parametrize("kind", NEARLY)
-    @pytest.mark.parametrize("share", [0.02, 0.3, 0.35])
-    def test_truncated_file_is_refused(self, kind: str, share: float) -> None:
+    @pytest.mark.parametrize("share", [0.02, 0.3, 0.35, 0.7, 0.95])
+    def test_truncated_file_is_refused_but_for_a_jpeg_with_most_of_its_rows(self, kind: str, share: float) -> None:
         content = encoded(NOISE, kind, **NEARLY[kind])
-        with pytest.raises(InvalidPhotographError):
-            read(content[: int(share * len(content))])
-
-    @pytest.mark.parametrize("kind", ["PNG", "WEBP"])
-    @pytest.mark.parametrize("share", [0.7, 0.95])
-    def test_pixels_of_truncated_files_of_other_formats_are_not_used(self, kind: str, share: float) -> None:
-        content = encoded(NOISE, kind, **NEARLY[kind])
-        with pytest.raises(InvalidPhotographError, match="that is damaged, or coded in a way"):
-            read(content[: int(share * len(content))])
+        if kind != "JPEG" or share < 0.5:
+            words = "that is damaged, or coded in a way" if kind != "JPEG" and share > 0.5 else None
+            with pytest.raises(InvalidPhotographError, match=words):
+                read(content[: int(share * len(content))])
 
     def test_rows_before_the_end_of_a_truncated_jpeg_are_used(self) -> None:
         content = encoded(NOISE, "JPEG", quality=95)
@@ -279,6 +268,10 @@ class TestRefused:
         assert len(content) < 700_000
         with pytest.raises(InvalidPhotographError, match=r"JPEG with more than 20 scans, the limit \(max_scans"):
             read(content)
+        limits = PhotographLimits(max_scans=8)
+        read(of_scans(256, 128, 2), limits)
+        with pytest.raises(InvalidPhotographError, match=r"more than 8 scans"):
+            read(of_scans(256, 128, 3), limits)
 
     @pytest.mark.parametrize("kind", [b"VP8X", b"VP8L", b"VP8 "])
     def test_webp_bomb_is_refused_before_allocation(self, kind: bytes) -> None:

@@ -25,24 +25,17 @@ from lalaloc_core.photograph.projection import is_sphere
 from lalaloc_core.photograph.spheres import level
 from tests.core.fault_photographs import FOLDER
 from tests.core.taken import EXAMPLES, PHONE, jpeg, opened, sphere, take
+from tests.core.test_photo_sphere import crop, encoded, xmp
 from tests.painted import picture_file
 from tests.strategies import present
 
 Tag = ExifTags.Base
 MAIN = Perspective.of_hfov(640, 480, math.radians(67.3))
 ULTRAWIDE = Perspective.of_hfov(640, 480, math.radians(106.2))
-GPANO = (
-    '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
-    '<rdf:Description xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {}/></rdf:RDF></x:xmpmeta>'
-)
 
 
 def view_of(camera: Camera, name: str = "living_room", heading_deg: float = 0.0) -> np.ndarray:
     return take(sphere(name), camera, heading_deg=heading_deg)
-
-
-def with_xmp(pixels: np.ndarray, properties: str) -> bytes:
-    return picture_file(pixels, "JPEG", xmp=GPANO.format(properties).encode())
 
 
 class TestProjection:
@@ -96,19 +89,16 @@ class TestProjection:
 
     def test_gpano_metadata_decide(self) -> None:
         scene = sphere("kitchen")
-        part = (
-            'GPano:ProjectionType="{}" GPano:FullPanoWidthPixels="1024" GPano:FullPanoHeightPixels="512" '
-            'GPano:CroppedAreaImageWidthPixels="512" GPano:CroppedAreaImageHeightPixels="256" '
-            'GPano:CroppedAreaLeftPixels="256" GPano:CroppedAreaTopPixels="128"'
-        )
-        view = opened(with_xmp(scene[128:384, 256:768].copy(), part.format("equirectangular")))
+        part = crop(256, 128, 512, 256)
+        view = opened(encoded(scene[128:384, 256:768].copy(), "JPEG", xmp(**part)))
         assert (view.projection, view.projection_source) == ("equirectangular", "gpano")
         assert view.azimuths == pytest.approx((-0.5 * math.pi, 0.5 * math.pi))
         strip = take(scene, Around(width=512, height=256, hfov=math.pi))
-        view = opened(with_xmp(strip, part.format("cylindrical")))
+        content = encoded(strip, "JPEG", xmp(**part, ProjectionType="cylindrical"))
+        view = opened(content)
         assert (view.projection, view.hfov.source) == ("cylindrical", "gpano")
         assert view.hfov.value == pytest.approx(math.pi)
-        view = opened(with_xmp(strip, part.format("cylindrical")), intrinsics=Intrinsics(fx=400.0, fy=400.0))
+        view = opened(content, intrinsics=Intrinsics(fx=400.0, fy=400.0))
         assert view.warnings == ("intrinsics are not used: the photograph is a strip",)
 
     def test_strip_asks_for_its_angle(self) -> None:
@@ -219,8 +209,10 @@ class TestTilt:
         assert np.median(np.abs(errors), axis=0).max() < 1.0
         assert (np.abs(errors) < 3.0 * np.array(deviations)).mean() > 0.85
 
-    def test_blank_wall_tells_nothing_about_the_tilt(self) -> None:
-        view = opened(jpeg(np.full((480, 640, 3), 200, np.uint8)), hfov_deg=67.0)
+    @pytest.mark.parametrize("light", [200, 8])
+    def test_blank_wall_tells_nothing_about_the_tilt(self, light: int) -> None:
+        view = opened(jpeg(np.full((480, 640, 3), light, np.uint8)), hfov_deg=67.0)
+        assert [text.split(",")[0] for text in view.warnings] == ["the photograph is dark"] * (light < 12)
         assert view.pitch.source == view.roll.source == "assumed"
         assert math.degrees(view.pitch.sd) > 10.0
 
@@ -372,7 +364,8 @@ def test_lines_of_a_picture_in_perspective_are_straight(name: str, heading_deg: 
 def test_camera_with_an_orientation_or_a_stated_tilt_tells_which_side_is_up() -> None:
     upright = view_of(MAIN, heading_deg=120.0)
     by_software, by_camera = jpeg(upright, orientation=1), jpeg(upright, orientation=1, maker="Phone")
-    assert [opened(content).is_upright for content in (by_software, by_camera)] == [False, True]
+    by_editor = jpeg(upright[:-1], orientation=1, maker="Phone")
+    assert [opened(content).is_upright for content in (by_software, by_camera, by_editor)] == [False, True, False]
     assert opened(by_software, pitch_deg=40.0).is_upright
 
 

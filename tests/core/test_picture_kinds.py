@@ -70,9 +70,10 @@ def test_scanned_plans_are_drawings(seed: int) -> None:
     assert is_drawing(np.asarray(Image.open(io.BytesIO(draw_plan("scanned", seed).jpeg())).convert("RGB")))
 
 
-def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked() -> None:
+@pytest.mark.parametrize("name", ["real/hotel_room.jpg", "phone.jpg", "turn_1.jpg", "kitchen.jpg"])
+def test_photograph_given_as_a_plan_is_refused_before_its_scale_is_asked(name: str) -> None:
     with pytest.raises(InvalidFloorPlanError, match="looks like a photograph, not like a floor plan"):
-        import_plan((EXAMPLES / "real/hotel_room.jpg").read_bytes())
+        import_plan((EXAMPLES / name).read_bytes())
 
 
 @pytest.mark.parametrize("stated", [StatedCamera(projection="perspective", hfov_deg=70.0), None])

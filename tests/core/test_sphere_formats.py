@@ -13,32 +13,20 @@ import pytest
 from PIL import ExifTags, Image
 
 from lalaloc_core.errors import InvalidPhotographError
-from lalaloc_core.photograph import Photograph, StatedCamera, open_photograph
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
 from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format
-from tests.core.taken import jpeg, sphere, take, within_bars
-from tests.core.test_photo_sphere import encoded, xmp
+from tests.core.taken import jpeg, opened, sphere, take, within_bars
+from tests.core.test_photo_sphere import crop, encoded, xmp
 from tests.painted import picture_file
 from tests.strategies import present
 
-PART: dict[str, object] = {
-    "FullPanoWidthPixels": 1024,
-    "FullPanoHeightPixels": 512,
-    "CroppedAreaImageWidthPixels": 600,
-    "CroppedAreaImageHeightPixels": 310,
-    "CroppedAreaTopPixels": 100,
-}
 NAMES = ("bedroom", "kitchen", "living_room", "study")
 
 
 @cache
 def small(name: str) -> np.ndarray:
     return cv2.resize(sphere(name), (1024, 512), interpolation=cv2.INTER_AREA)
-
-
-def opened(content: bytes, stated: StatedCamera | None = None) -> Photograph:
-    return open_photograph(content, sphere_size=(128, 256), stated=stated)
 
 
 def faces(sphere: np.ndarray) -> list[np.ndarray]:
@@ -155,9 +143,9 @@ def test_format_that_is_not_converted_is_refused_by_name(name: str) -> None:
 
 def test_statement_turns_a_refusal_into_a_warning() -> None:
     pixels = unusable(small("kitchen"))["dual fisheye"]
-    view = opened(jpeg(pixels), StatedCamera(projection="equirectangular"))
+    view = opened(jpeg(pixels), projection="equirectangular")
     assert "two circles that are not stitched" in view.warnings[0]
-    assert opened(jpeg(pixels), StatedCamera(hfov_deg=90.0)).warnings == ()
+    assert opened(jpeg(pixels), hfov_deg=90.0).warnings == ()
     with pytest.raises(InvalidPhotographError, match="two circles"):
         opened(encoded(pixels, "JPEG", xmp(ProjectionType="equirectangular")))
 
@@ -203,7 +191,7 @@ class TestParts:
 
     def part(self, left: int, **others: float) -> bytes:
         pixels = small("kitchen")[100:410, left : left + 600]
-        return encoded(pixels, "JPEG", xmp(**PART, CroppedAreaLeftPixels=left, **others))
+        return encoded(pixels, "JPEG", xmp(**crop(left, 100, 600, 310, **others)))
 
     @pytest.mark.parametrize("pitch_deg", [0.0, 5.0])
     def test_heading_is_that_of_the_centre_of_the_picture(self, pitch_deg: float) -> None:
@@ -218,9 +206,8 @@ class TestParts:
         assert abs(seen[0] + seen[-1] - 255) <= 2
 
     def test_part_beyond_the_seam_is_refused(self) -> None:
-        stated = PART | {"CroppedAreaImageHeightPixels": 300, "CroppedAreaLeftPixels": 800}
         with pytest.raises(InvalidPhotographError, match=r"600 x 300 at \(800, 100\) is not within .* not a full"):
-            opened(encoded(small("kitchen")[100:400, :600], "JPEG", xmp(**stated)))
+            opened(encoded(small("kitchen")[100:400, :600], "JPEG", xmp(**crop(800, 100, 600, 300))))
 
     def test_strip_of_a_full_turn_must_close(self) -> None:
         stated = {"ProjectionType": "cylindrical", "FullPanoWidthPixels": 1024, "CroppedAreaImageWidthPixels": 1024}
@@ -246,7 +233,7 @@ def test_photograph_is_taken_out_of_its_bars(kind: str) -> None:
 def test_black_zenith_and_nadir_are_of_the_sphere() -> None:
     pixels = small("kitchen").copy()
     pixels[:60] = pixels[-60:] = 0
-    for view in (opened(jpeg(pixels)), opened(jpeg(pixels), StatedCamera(projection="equirectangular"))):
+    for view in (opened(jpeg(pixels)), opened(jpeg(pixels), projection="equirectangular")):
         assert view.is_sphere
         assert not any("bars" in text for text in view.warnings)
 

@@ -81,13 +81,14 @@ def test_features_of_a_turn_are_sent_with_its_angles(tmp_path: Path, capsys: pyt
         ((), "give one or more photographs, or --turn"),
         (("photo.jpg", "--turn", "film.mp4"), "exclude each other"),
         (("--turn", "{}", "--heading", "10"), "--heading does not go with --turn"),
-        (("--turn", "{}"), "has 0 photographs; a turn has 2 to 100"),
-        (("--turn", "{}/film.mp4"), "is no MP4, MOV, WebM or Matroska film by its first bytes"),
+        (("--turn", "{}"), "has 0 photographs; a turn has 2 to 100; 'empty.jpg' is empty and was left out"),
+        (("--turn", "{}/film.mp4"), "is another file by its first bytes, not MP4, MOV, WebM or Matroska"),
     ],
 )
 def test_unusable_turns_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
 ) -> None:
     (tmp_path / "film.mp4").write_bytes(b"ffconcat version 1.0\n")
+    (tmp_path / "empty.jpg").touch()
     assert main(["localise", PLAN, *(argument.format(tmp_path) for argument in arguments)]) == 2
     assert message in capsys.readouterr().err

@@ -58,6 +58,18 @@ def test_clock_difference_is_found_by_common_places() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("names", "cameras"), [(("IMG_1", "IMG_2"), 1), (("IMG_1", "DSC_2"), 2), (("IMG_5", "IMG_2"), 2), (("", ""), 1)]
+)
+def test_cameras_of_one_model_have_clocks_of_their_own(names: tuple[str, str], cameras: int) -> None:
+    album = _album(*(("A", at) for at in _minutes(0, 2, 4, 61, 63, 65)))
+    album = [replace(each, name=names[number // 3]) for number, each in enumerate(album)]
+    found = walk_order(album, {(0, 3): _CERTAIN, (1, 4): _CERTAIN, (2, 5): _CERTAIN})
+    assert found.order.tolist() == ([0, 3, 1, 4, 2, 5] if cameras == 2 else [*range(6)])
+    assert len(found.warnings) == cameras - 1
+    assert cameras == 1 or f"the clock of A (of '{names[1]}') is 1:01:00 ahead of that of A (of" in found.warnings[0]
+
+
 def test_clocks_that_cannot_be_compared_order_each_camera() -> None:
     own, other = _minutes(4, 0, 2), _minutes(1, 5)
     found = walk_order(_album(*(("A", at) for at in own), *(("B", at) for at in other)), {(0, 3): _CERTAIN})
@@ -92,6 +104,8 @@ def test_photographs_without_time_and_later_visits_follow_nothing() -> None:
     follows = dict(zip(found.order.tolist(), found.follows.tolist(), strict=True))
     assert follows == {0: False, 1: True, 2: True, 3: False, 4: False}
     assert found.warnings[0].startswith("1 of 5 photographs have no time")
+    # A time that all have is not theirs.
+    assert "3 of 3 photographs have no time" in walk_order(_album(*[("A", _TEN)] * 3), {}).warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -153,6 +167,8 @@ def test_times_of_xmp_and_of_gps_count_without_others(name: bytes) -> None:
     assert read_taken(exif, packets, width=0, height=0).at == _TEN.replace(second=30, tzinfo=UTC)
     exif.get_ifd(0x8769)[0x9003] = "2026:05:01 09:00:00"
     assert read_taken(exif, packets, width=0, height=0).at == datetime(2026, 5, 1, 9)
+    exif.get_ifd(0x8769)[0x9010] = "+02:00"
+    assert read_taken(exif, packets, width=0, height=0).at == datetime(2026, 5, 1, 7, tzinfo=UTC)
 
 
 def _picture(path: Path, minute: int | None = None) -> None:
@@ -170,6 +186,10 @@ def test_turns_are_ordered_by_time_else_by_the_numbers_in_names(tmp_path: Path) 
     for number, minute in ((1, 5), (2, 3), (10, 4)):
         _picture(tmp_path / f"{number}.jpg", minute)
     assert [file.stem for file in turn_files(tmp_path)[0]] == ["2", "10", "1"]
+    assert turn_files(tmp_path)[1] == []
+    _picture(tmp_path / "2.jpg", 5)
+    assert [file.stem for file in turn_files(tmp_path)[0]] == ["1", "2", "10"]
+    assert turn_files(tmp_path)[1][0].startswith("1 of 3 photographs have no time of their own, so all are in the ord")
 
 
 def test_empty_and_hidden_files_of_a_turn_are_left_out_and_named(tmp_path: Path) -> None:

@@ -144,9 +144,11 @@ def test_pictures_are_added_once_and_unreadable_files_left_out(
     client: httpx.Client, plan_id: str, pictures: list[bytes]
 ) -> None:
     album_id = create(client, plan_id)
-    unreadable, *first, empty = add(client, album_id, [b"no picture", *pictures[:2], b""])
+    strip = picture_file(Image.new("RGB", (900, 100)), "JPEG")
+    unreadable, *first, empty = add(client, album_id, [strip, *pictures[:2], b""])
     assert [line["status"] for line in (unreadable, *first, empty)] == [422, 201, 201, 422]
     assert unreadable["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
+    assert "create an album with projection=cylindrical and hfov_deg" in unreadable["problem"]["detail"]
     assert (unreadable["name"], first[0]["photograph"]["name"]) == ("0.jpg", "1.jpg")
     again = add(client, album_id, [pictures[1], pictures[0], pictures[2], pictures[2]])
     assert [line["status"] for line in again] == [200, 200, 201, 200]

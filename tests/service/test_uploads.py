@@ -127,7 +127,7 @@ def test_body_without_a_length_stops_at_the_limit(
     with start_app(tmp_path, **{name: 100_000}) as client:
         response = client.post(path, content=endless(), headers={"content-type": media})
         problem = assert_problem(response, 413, "upload-too-large")
-        assert f"the limit is 100000 bytes (LALALOC_{name.upper()})" in problem["detail"]
+        assert f"the limit is 100000 bytes (LALALOC_{name.upper()}): send" in problem["detail"]
 
 
 def test_boundary_that_occurs_in_a_part_is_refused(client: httpx.Client) -> None:

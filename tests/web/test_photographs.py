@@ -48,6 +48,10 @@ def test_phone_photograph_shows_its_layout_in_perspective(desktop: Visit, tmp_pa
     assert on > 100
     page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
     expect(page.locator(".stage")).to_have_attribute("data-shape", "around")
+    page.locator("#photo-file").set_input_files(FOLDER / "sphere_orientation6.jpg")
+    desktop.find()
+    expect(page.locator(".stage.stored")).to_have_attribute("data-shape", "whole")
+    expect(page.locator("img.whole")).to_have_css("image-orientation", "none")
 
 
 @pytest.mark.slow

@@ -32,13 +32,10 @@ export const hasOptions = (file: File): boolean => PLAN_FILES.test(file.name);
 export async function checkPixels(file: File): Promise<void> {
   const picture = new Image();
   picture.src = URL.createObjectURL(file);
-  try {
-    await new Promise((resolve) => {
-      picture.onload = picture.onerror = resolve;
-    });
-  } finally {
-    URL.revokeObjectURL(picture.src);
-  }
+  await new Promise((resolve) => {
+    picture.onload = picture.onerror = resolve;
+  });
+  URL.revokeObjectURL(picture.src);
   // The browser can show fewer pictures than the service reads, and the limit is the service's to enforce.
   const { naturalWidth: width, naturalHeight: height } = picture;
   const limits = width > 0 ? await api.limits().catch(() => null) : null;

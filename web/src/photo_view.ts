@@ -84,9 +84,11 @@ export class PhotoView {
 
   /** Show a photograph; null shows none. Rejects if the file is not a picture. */
   async setPicture(file: File | null): Promise<void> {
-    this.release(this.url);
+    const before = this.url;
+    // The viewer has loaded it by then, or failed to.
+    if (before !== null) void this.loading.catch(() => undefined).then(() => URL.revokeObjectURL(before));
     this.url = file === null ? null : URL.createObjectURL(ended(file));
-    this.stage.classList.toggle("empty", file === null);
+    this.stage.className = file === null ? "stage empty" : "stage";
     this.stage.dataset.name = file?.name ?? "";
     if (this.url === null) {
       this.picture.removeAttribute("src");
@@ -118,8 +120,12 @@ export class PhotoView {
     // The service knows better than `isSphere`.
     const isPart = view !== null && view.hfov.source === "given" && view.hfov.value_deg < 360;
     const isFlat = view !== null && (view.camera !== null || view.projection === "cylindrical" || isPart);
-    if (isFlat && this.shape !== "flat") this.setShape("flat");
-    else this.draw();
+    // A sphere whose orientation, on its side, the service ignored is shown as it is stored, by the style sheet.
+    const isStored = view?.hfov.value_deg === 360 && this.picture.naturalHeight > this.picture.naturalWidth;
+    if (isStored) this.stage.classList.add("stored");
+    const shape = isStored ? "whole" : isFlat ? "flat" : this.shape;
+    if (shape === this.shape) this.draw();
+    else this.setShape(shape);
   }
 
   /** Draw the whole photograph with the layout; null if the browser cannot show it. */
@@ -128,6 +134,7 @@ export class PhotoView {
     if (this.url === null || naturalWidth === 0 || this.stage.classList.contains("empty")) return null;
     const share = Math.min(1, SAVED_PIXELS / Math.max(naturalWidth, naturalHeight));
     const size: Size = { width: Math.round(share * naturalWidth), height: Math.round(share * naturalHeight) };
+    if (this.stage.matches(".stored")) [size.width, size.height] = [size.height, size.width];
     const canvas = h("canvas", { width: size.width, height: size.height }),
       context = canvas.getContext("2d")!;
     context.drawImage(this.picture, 0, 0, size.width, size.height);
@@ -139,12 +146,6 @@ export class PhotoView {
   private setShape(shape: Shape): void {
     this.shape = shape;
     void this.refresh();
-  }
-
-  /** Release a picture's memory after the viewer has loaded it. */
-  private release(url: string | null): void {
-    if (url === null) return;
-    void this.loading.catch(() => undefined).then(() => URL.revokeObjectURL(url));
   }
 
   private async refresh(): Promise<void> {

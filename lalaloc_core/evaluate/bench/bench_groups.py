@@ -23,18 +23,11 @@ from lalaloc_core.evaluate.bench.service_latency import bench_service
 from lalaloc_core.evaluate.bench.steps import bench_steps
 from lalaloc_core.evaluate.bench.turns import bench_films, bench_turns
 
+_FUNCTIONS = bench_service, bench_turns, bench_films, bench_steps, bench_albums, bench_house
+_FUNCTIONS += bench_localisability, bench_uninformative, bench_azimuths, bench_album_weights
 _BENCHMARKS: Mapping[str, Callable[[Setting], dict[str, Any]]] = {
     **{group: partial(measure, rows) for group, rows in GROUPS.items()},
-    "service": bench_service,
-    "turns": bench_turns,
-    "films": bench_films,
-    "steps": bench_steps,
-    "albums": bench_albums,
-    "house": bench_house,
-    "localisability": bench_localisability,
-    "uninformative": bench_uninformative,
-    "azimuths": bench_azimuths,
-    "album_weights": bench_album_weights,
+    **{function.__name__.removeprefix("bench_"): function for function in _FUNCTIONS},
 }
 # Measured only on request: it takes hours, and chooses weights instead of measuring them.
 _ON_REQUEST = ("album_weights",)

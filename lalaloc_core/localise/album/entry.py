@@ -171,11 +171,8 @@ class AlbumPhotograph:
         header = _Header(
             id=self.id,
             taken_at=None if taken.at is None else taken.at.isoformat(),
-            make=taken.make,
-            model=taken.model,
-            width=taken.width,
-            height=taken.height,
             features=len(features),
+            **{name: getattr(taken, name) for name in _OF_CAMERA},
         )
         text = json.dumps(dataclasses.asdict(header), allow_nan=False).encode()
         used = _PREFIX.size + len(text) + len(features) + COLOURS
@@ -199,6 +196,9 @@ class _Header:
     width: int
     height: int
     features: int
+
+
+_OF_CAMERA = ("make", "model", "width", "height")
 
 
 def photograph_entry(id: str, photograph: Photograph, taken: Taken | None = None, name: str = "") -> AlbumPhotograph:
@@ -240,10 +240,10 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
         at = None if header.taken_at is None else datetime.fromisoformat(header.taken_at)
     except ValueError as error:
         raise InvalidEntryError(f"taken_at is '{header.taken_at!s:.50}', which is no time") from error
+    texts = {name: getattr(header, name) for name in _OF_CAMERA[:2]}
     faults = {
         "id": not 0 < len(header.id) <= _MAX_ID or not header.id.isprintable(),
-        "make": len(header.make) > MAX_NAME or not header.make.isprintable(),
-        "model": len(header.model) > MAX_NAME or not header.model.isprintable(),
+        **{name: len(text) > MAX_NAME or not text.isprintable() for name, text in texts.items()},
         "width": not 0 <= header.width <= MAX_SIDE,
         "height": not 0 <= header.height <= MAX_SIDE,
         "features": not 0 < header.features <= len(body) - COLOURS,
@@ -259,7 +259,7 @@ def read_entry(content: bytes, bundle: Bundle) -> AlbumPhotograph:
     records = np.frombuffer(rest, _RECORD)
     descriptors = Descriptors(records["place"] / _WHOLE, records["bits"].copy())
     photograph = read_features(_inflated(body[: header.features]), bundle)
-    taken = Taken(at=at, make=header.make, model=header.model, width=header.width, height=header.height)
+    taken = Taken(at=at, **texts, width=header.width, height=header.height)
     return AlbumPhotograph(
         id=header.id,
         photograph=photograph,

@@ -13,7 +13,8 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, timedelta, tzinfo
+from datetime import UTC, datetime, timedelta, tzinfo
+from itertools import pairwise
 from pathlib import PurePath
 
 import numpy as np
@@ -21,7 +22,6 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.localise.album.entry import AlbumPhotograph
 from lalaloc_core.localise.album.links import Found, is_one_place, similarity
-from lalaloc_core.photograph.exif import Taken
 from lalaloc_core.photograph.picture_folders import with_numbers
 
 # Share of the photographs by a clock that must have a time for its order to count, and of those without a time whose
@@ -55,8 +55,9 @@ class WalkOrder:
 
 def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int, int], Found]) -> WalkOrder:
     """Return the order in which photographs were taken, as far as clocks or names tell; `links` are by their number."""
-    zones = {_name(each.taken): each.taken.at.tzinfo for each in photographs if each.taken.at and each.taken.at.tzinfo}
-    seconds, rows_of = _seconds(photographs, zones), _clocks(photographs, zones)
+    cameras, taken = _cameras(photographs), [each.taken.at for each in photographs]
+    zones = {camera: at.tzinfo for camera, at in zip(cameras, taken, strict=True) if at is not None and at.tzinfo}
+    seconds, rows_of = _seconds(cameras, taken, zones), _clocks(cameras, zones)
     names = [name for name, rows in rows_of.items() if np.isfinite(seconds[rows]).mean() >= _TIMED]
     # Cameras with time zones are right, so the others are compared with them.
     names.sort(key=lambda name: name != _ZONED)
@@ -81,7 +82,7 @@ def walk_order(photographs: Sequence[AlbumPhotograph], links: Mapping[tuple[int,
         more = f" and {len(names) - _MAX_NAMED} others" if len(names) > _MAX_NAMED else ""
         warnings.append(
             f"the clocks of {', '.join(names[:_MAX_NAMED])}{more} could not all be compared, so photographs are in "
-            "order within each camera only"
+            "order within each camera only: correct the times of one, or add photographs of the same places by both"
         )
     is_timed = clock >= 0
     of_walk = np.where(is_timed, np.array([*walk, -1])[clock], -1)
@@ -131,10 +132,10 @@ def _on_missing(
     """Return warnings on photographs without a time, and on those whose time is not used."""
     found, count = [], len(photographs)
     if untimed.any():
-        text = f"{untimed.sum()} of {count} photographs have no time, so no place in the order"
+        text = f"{untimed.sum()} of {count} photographs have no time of their own, so no place in the order"
         if len(numbered):
             first, last = (photographs[row].name for row in (numbered[0], numbered[-1]))
-            text = f"{untimed.sum()} of {count} photographs have no time: " + (
+            text = f"{untimed.sum()} of {count} photographs have no time of their own: " + (
                 f"{len(numbered)} are in the order of the numbers in their names, from '{first}' to '{last}'"
                 if is_walk
                 else "the numbers in their names tell no order, as neighbours look no more alike than others"
@@ -148,27 +149,59 @@ def _on_missing(
     return found
 
 
-def _name(taken: Taken) -> str:
-    return " ".join(filter(None, (taken.make, taken.model))) or "an unknown camera"
+def _cameras(photographs: Sequence[AlbumPhotograph]) -> list[str]:
+    """Return the camera of each photograph, by maker and model, and of several of one model by its first photograph."""
+    of_model: defaultdict[str, list[int]] = defaultdict(list)
+    for row, each in enumerate(photographs):
+        of_model[" ".join(filter(None, (each.taken.make, each.taken.model))) or "an unknown camera"].append(row)
+    cameras = [""] * len(photographs)
+    for model, rows in of_model.items():
+        for row, first in zip(rows, _first_of_runs([photographs[row] for row in rows]), strict=True):
+            cameras[row] = f"{model} (of '{first}')" if first else model
+    return cameras
 
 
-def _seconds(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> Float[np.ndarray, "n"]:
-    """Return the times of photographs, of those without a time zone by the camera's clock; NaN without any."""
-    seconds = np.full(len(photographs), np.nan)
-    for number, photograph in enumerate(photographs):
-        taken = photograph.taken
-        if taken.at is not None:
-            zone = taken.at.tzinfo or zones.get(_name(taken), UTC)
-            seconds[number] = taken.at.replace(tzinfo=zone).timestamp()
+def _first_of_runs(photographs: Sequence[AlbumPhotograph]) -> list[str]:
+    """Return the first name of each photograph's run, which ends where times go back along names, or these change.
+
+    Runs are of cameras of one model whose clocks differ if their times are apart; if not, the names are empty.
+    """
+    firsts, times, first, before = [""] * len(photographs), list[list[datetime]]([[]]), "", ""
+    for row in sorted(range(len(firsts)), key=lambda row: with_numbers(photographs[row].name)):
+        name, at = photographs[row].name, photographs[row].taken.at
+        at, begin = at and at.replace(tzinfo=None), re.sub(r"\d.*", "", PurePath(name).stem.lower())
+        if times[-1] and (begin != before or (at and (times[-1][-1] - at).total_seconds() > _SAME_S)):
+            times.append([])
+        firsts[row] = first = first if times[-1] else name
+        times[-1] += [] if at is None else [at]
+        before = begin
+    spans = sorted((min(each), max(each)) for each in times if len(each) >= _MIN_PAIRS)
+    is_apart = len(spans) == len(times) > 1 and all(last < first for (_, last), (first, _) in pairwise(spans))
+    return firsts if is_apart else [""] * len(firsts)
+
+
+def _seconds(
+    cameras: Sequence[str], taken: Sequence[datetime | None], zones: Mapping[str, tzinfo]
+) -> Float[np.ndarray, "n"]:
+    """Return the times of photographs, of those without a time zone by the camera's clock; NaN without any.
+
+    A time that all of a camera's photographs have is not theirs.
+    """
+    seconds = np.full(len(taken), np.nan)
+    for number, (camera, at) in enumerate(zip(cameras, taken, strict=True)):
+        if at is not None:
+            seconds[number] = at.replace(tzinfo=at.tzinfo or zones.get(camera, UTC)).timestamp()
+    for rows in _clocks(cameras, {}).values():
+        if len(rows) >= _MIN_PAIRS and len(np.unique(seconds[rows])) == 1:
+            seconds[rows] = np.nan
     return seconds
 
 
-def _clocks(photographs: Sequence[AlbumPhotograph], zones: Mapping[str, tzinfo]) -> dict[str, Int[np.ndarray, "m"]]:
+def _clocks(cameras: Sequence[str], zones: Mapping[str, tzinfo]) -> dict[str, Int[np.ndarray, "m"]]:
     """Return the numbers of the photographs by clock; cameras that state time zones have one clock together."""
     found: dict[str, list[int]] = {}
-    for number, photograph in enumerate(photographs):
-        name = _name(photograph.taken)
-        found.setdefault(_ZONED if name in zones else name, []).append(number)
+    for number, camera in enumerate(cameras):
+        found.setdefault(_ZONED if camera in zones else camera, []).append(number)
     return {name: np.array(rows) for name, rows in found.items()}
 
 

@@ -60,7 +60,9 @@ def compose_answer(
     warnings = [*_heading_warnings(found, known), *warnings, *spot.photograph.warnings]
     warnings += found.query.warnings if confidence is not None and confidence.position < CONFIDENT else ()
     if confidence is not None:
-        reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=bool(warnings))
+        # The field of view of a turn, of which each is warned, is known well enough.
+        is_warned = bool(warnings) and not found.query.is_turn
+        reason = reason_for(confidence.position, confidence.elsewhere, found.query.objects, is_warned=is_warned)
     return Answer(
         position=best.position,
         heading_deg=best.heading_deg,

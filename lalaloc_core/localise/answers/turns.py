@@ -192,8 +192,8 @@ def overlap_warnings(angles: Sequence[TurnAngles], hfov: float) -> list[str]:
     for index, angle in enumerate(angles):
         groups.setdefault(angle.group, []).append(index)
     remedy = (
-        f"turn by at most half the field of view, {math.degrees(0.5 * hfov):.0f}°, from one photograph to the next, or "
-        "state the relative headings"
+        "send them in the order in which they were taken, turn by at most half the field of view, "
+        f"{math.degrees(0.5 * hfov):.0f}°, from one photograph to the next, or state the relative headings"
     )
     if len(groups) > 1:
         names = "; ".join(", ".join(f"photo[{index}]" for index in groups[group]) for group in sorted(groups))
@@ -242,12 +242,14 @@ def compose_turn(
         )
         for index, (photograph, picture) in enumerate(zip(turn.photographs, found.pictures, strict=True))
     ]
-    named = [f"photo[{index}]: {text}" for index, pose in enumerate(poses) for text in pose.view.warnings]
+    film, told = turn.film, [(text, index) for index, pose in enumerate(poses) for text in pose.view.warnings]
+    # Frames of a film have most warnings in common.
+    told = told if film is None else [*{text: (text, index) for text, index in reversed(told)}.values()][::-1]
+    named = [f"photo[{index}]: {text}" for text, index in told]
     contradicted = [
         f"photo[{index}]: its relative heading contradicts the other photographs and was ignored"
         for index in found.contradicted
     ]
-    film = turn.film
     lying = found.pictures[0].query.warnings if (poses[0].confidence or 0.0) < CONFIDENT else ()
     fields: dict[str, Any] = vars(poses[0]) | {"warnings": [*turn.warnings, *contradicted, *named, *warnings, *lying]}
     return TurnAnswer(
