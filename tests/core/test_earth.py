@@ -90,7 +90,7 @@ def test_geojson_is_read_anywhere(place: tuple[float, float]) -> None:
         | {"anchor": {"longitude": place[0], "latitude": place[1], "north_deg": 0.0}}
     )
     assert plan.anchor is not None
-    content = FORMATS["geojson"].write(plan.to_dict(), plan.anchor)
+    content = FORMATS["geojson"].call("write", plan.to_dict(), plan.anchor)
     imported = import_plan(content)
     found = imported.plan()
     assert sorted(room.area_m2 for room in found.rooms) == pytest.approx([12.0, 15.0], abs=0.01)
