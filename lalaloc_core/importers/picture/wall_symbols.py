@@ -64,7 +64,7 @@ class GapReader:
     def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
         # Arcs of few pixels are compared on a finer picture: their lines would cover what is drawn beside them.
-        self._finer = max(1, round(ink.metres_per_pixel / _COARSE_M))
+        self._finer = math.ceil(ink.metres_per_pixel / _COARSE_M)
         gray, inked, wall = (
             cv2.resize(part.astype(np.uint8), None, fx=self._finer, fy=self._finer, interpolation=cv2.INTER_CUBIC)
             for part in (ink.gray, ink.lines, walls.mask)
