@@ -183,11 +183,10 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
-        relative = depth_m / walls.thickness_m
-        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
+        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] * walls.thin_m <= depth_m <= _LIKE_WALL[1] * walls.thickness_m):
             return None
         is_weak = found.kind != "nothing" and found.confidence <= _WEAK
-        if is_weak and not (gap.is_sure and relative >= _AS_WALL):
+        if is_weak and not (gap.is_sure and depth_m >= _AS_WALL * walls.thin_m):
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None

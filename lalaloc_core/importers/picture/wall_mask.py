@@ -17,6 +17,8 @@ from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
+# Share of the walls, by area, that is thinner than thin ones.
+_THIN_WALLS = 0.2
 # Broadest strokes and leaves between two lines relative to walls, with the thinnest inner wall (m) beside them.
 _STROKE, _LEAF = (0.4, 0.075), (0.55, 0.1)
 # Largest white gap between the two lines of a wall; the sector of a door swing is wider.
@@ -51,10 +53,14 @@ _ALONG_AXIS_DEG, _ALONG_AXIS_M = 6.0, 0.06
 
 @dataclass(frozen=True, eq=False)
 class WallMask:
-    """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls."""
+    """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls.
+
+    `thickness_m` is usual, and `thin_m` that of thin walls: inner ones can be a third as thick as outer ones.
+    """
 
     mask: Bool[np.ndarray, "h w"]
     thickness_m: float
+    thin_m: float
     cavities: Int[np.ndarray, "h w"] | None
 
 
@@ -197,7 +203,8 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
         _, found, stats, _ = cv2.connectedComponentsWithStats(filled, connectivity=8)
         # Longer areas are panes of windows.
         kept |= (stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= 2 * len(notch))[np.asarray(found)]
-    return WallMask(kept, thickness, cavities) if kept.any() else None
+    thin_m = usual_thickness(kept.astype(np.uint8), _THIN_WALLS) * ink.metres_per_pixel
+    return WallMask(kept, thickness, thin_m, cavities) if kept.any() else None
 
 
 def _min_thickness_px(ink: Ink) -> int:
