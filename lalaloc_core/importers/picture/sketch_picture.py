@@ -53,6 +53,8 @@ _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M, _THICK_M = 1.2, 0.6
 # Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
 _WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Least width of the gate of a garage (m), and width of windows relative to a clearly wider one.
+_GATE_M, _NARROWER = 2.0, 0.8
 # Least number of doors that are drawn without a swing, least share of other openings that have more lines, and share of
 # a line that is drawn: dashes in an inner wall are a beam.
 _DOORS_ALIKE, _UNLIKE, _DASHED = 3, 0.5, 0.7
@@ -153,11 +155,15 @@ def sketch_picture(
         budget.trace.add("no room", builder.no_room)
     budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
-    rooms += [SketchedRoom(align_edges(area)) for area in _terraces(best, ink, letterings)]
+    terraces = _terraces(best, ink, letterings)
+    rooms += [SketchedRoom(align_edges(area)) for area in terraces]
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
     # A gap away from all rooms lies between other strokes.
     gaps = [gap for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
     openings = _openings(best, gaps, ink, builder, budget)
+    garages = [shapely.Point(text.position) for text in letterings if "garage" in text.room_types]
+    reach_m = 0.5 * best.walls.thickness_m + _BESIDE_M
+    openings = _with_ways(openings, [*best.enclosed.rooms, *terraces], garages, reach_m, builder)
     fixtures = _fixtures(symbols, shapes, best, builder) if has_symbols else []
     # Faces of walls are the middles of their lines.
     pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
@@ -273,6 +279,38 @@ def _openings(
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
+    return found
+
+
+def _with_ways(
+    openings: Sequence[SketchedOpening],
+    areas: Sequence[shapely.Polygon],
+    garages: Sequence[shapely.Point],
+    reach_m: float,
+    builder: ReportBuilder,
+) -> list[SketchedOpening]:
+    """Return the openings with a door for every area that is reached by windows alone: the clearly widest.
+
+    These are sliding doors of closets and terraces, between two areas, and gates, from a garage to the outside.
+    """
+    found, lines = list(openings), np.array([(opening.start, opening.end) for opening in openings]).reshape(-1, 2, 2)
+    along = lines[:, 1] - lines[:, 0]
+    widths = np.hypot(*along.T)
+    step = reach_m * along[:, ::-1] * [-1.0, 1.0] / widths[:, None]
+    places = lines.mean(axis=1) + step * np.array([[[1.0]], [[-1.0]]])
+    beside: list[set[int]] = [set() for _ in found]
+    for place, area in shapely.STRtree(areas).query(shapely.points(places.reshape(-1, 2)), predicate="within").T:
+        beside[place % len(found)].add(int(area))
+    for number, area in enumerate(areas):
+        least_m = _GATE_M if any(map(area.covers, garages)) else 0.0
+        own = [k for k in range(len(found)) if number in beside[k] and widths[k] >= least_m]
+        panes = [k for k in own if found[k].kind == "window" and (least_m or len(beside[k]) > 1)]
+        widest = max(panes, key=lambda k: widths[k], default=-1)
+        is_only = all(widths[k] <= _NARROWER * widths[widest] for k in panes if k != widest)
+        if panes and is_only and all(found[k].kind == "window" for k in own):
+            found[widest] = replace(found[widest], kind="door")
+            place = f"({found[widest].start[0]:.2f}, {found[widest].start[1]:.2f})"
+            builder.unsure.append(f"a window of {widths[widest]:.2f} m at {place} is taken for a door: no other is there")
     return found
 
 
