@@ -187,19 +187,19 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     def rank(gap: Gap) -> int | None:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
-        is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
+        is_bare = found.kind in ("leaf", "nothing") or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
-        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] * walls.thin_m <= depth_m <= _LIKE_WALL[1] * walls.thickness_m):
-            return None
-        is_weak = found.kind != "nothing" and found.confidence <= _WEAK
-        if is_weak and not (gap.is_sure and depth_m >= _AS_WALL * walls.thin_m):
+        is_thick = _LIKE_WALL[0] * walls.thin_m <= depth_m <= _LIKE_WALL[1] * walls.thickness_m
+        is_passage = gap.is_sure and gap.width <= widest and is_thick
+        is_weak = found.confidence <= _WEAK and not (gap.is_sure and depth_m >= _AS_WALL * walls.thin_m)
+        if (is_bare or is_weak) and not is_passage:
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None
         # Gaps overlap both walls by 2 cm, so that narrow ones seem deeper by up to a tenth.
         if depth_m > 1.1 * _CONFIG.thickest and (found.kind != "pane" or gap.width <= _MAX_BARE_GAP_M):
             return None
-        return ("swing", "pane", "line", "nothing").index(found.kind)
+        return ("swing", "pane", "line", "leaf", "nothing").index(found.kind)
 
     enclosed = enclose(wall_polygons(walls, ink, budget.check_time), [], (), _CONFIG, budget.check_time, rank)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
@@ -326,7 +326,7 @@ def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:
 
 def _kind(content: GapContent, width: float, lines_of_doors: float, *, is_inner: bool) -> OpeningKind:
     """Classify an opening. Lines in an inner wall are a door without a swing, in an outer wall a window."""
-    if content.kind == "swing":
+    if content.kind in ("swing", "leaf"):
         return "door"
     if content.kind == "nothing":
         return "passage"

@@ -27,6 +27,8 @@ _NEAR_M, _COARSE_M = 0.017, 0.02
 _DOOR_M = (0.5, 2.4)
 # Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
 _LEAF_ALONE, _BESIDE = 0.95, 0.45
+# Parts of a leaf around its hinge: all of it, the outer half, and the tip.
+_RADII = slice(21), slice(9, 20), slice(19, 23)
 # Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
 _BROKEN, _BROKEN_QUARTER = 0.35, 0.15
 # Widths of bow windows (m), and their smallest and largest depths relative to them.
@@ -45,13 +47,14 @@ class GapContent:
     """Content of a gap.
 
     Attributes:
-        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single line.
+        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single line,
+            "leaf" for leaves without an arc that stand open, which alone show no opening.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
         lines: number of lines along the wall.
         leaf_m: width of the leaf that swings, 0 without one.
     """
 
-    kind: Literal["swing", "pane", "line", "nothing"]
+    kind: Literal["swing", "pane", "line", "leaf", "nothing"]
     confidence: float
     warmth: float = 0.0
     lines: int = 0
@@ -101,6 +104,9 @@ class GapReader:
             return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
             return GapContent("line", share, warmth, lines)
+        leaf_m = self._leaves_alone(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
+        if leaf_m or (_DOOR_M[0] <= gap.width <= _DOOR_M[1] and self._is_folded(gap)):
+            return GapContent("leaf", _ARC, leaf_m=leaf_m)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
     def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int]:
@@ -109,21 +115,7 @@ class GapReader:
         It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
         leaf alone. A pale arc must stand out from what is drawn beside it.
         """
-        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
-        width = math.dist(start, end)
-        along = (end - start) / width
-        half = 0.5 * self._finer * gap.shape.area / gap.width / self._ink.metres_per_pixel
-        angles, reach = np.radians(np.arange(12.0, 91.0, 2.0)), np.arange(0.16, 1.25, 0.04)
-        # Number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
-        count, side, hinge, offset, angle, distance = np.meshgrid(
-            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], angles, reach, indexing="ij", sparse=True
-        )
-        radius = width / count * distance
-        x = width * hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle)
-        y = offset + side * radius * np.sin(angle)
-        columns = (start[0] + 1.0 + x * along[0] - y * along[1]).astype(np.intp)
-        rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
-        is_inked = near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
+        is_inked = self._around_hinges(gap, near, np.arange(12.0, 91.0, 2.0))
         # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
         arcs, leaves = is_inked[..., :36, 19:23], is_inked[..., :21].mean(axis=-1)
         shares = arcs.mean(axis=-2)
@@ -143,6 +135,59 @@ class GapReader:
         # Both of two leaves must be visible.
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
         return (two, 2) if two > one else (one, 1)
+
+    def _around_hinges(self, gap: Gap, near: Bool[np.ndarray, "h w"], angles_deg: np.ndarray) -> Bool[np.ndarray, "..."]:
+        """Return what is inked around the hinges that one or two leaves can have, up to 1.24 times their width.
+
+        Axes are the number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
+        """
+        half, reach = 0.5 * gap.shape.area / gap.width**2, np.arange(0.16, 1.25, 0.04)
+        count, side, hinge, offset, angle, distance = np.meshgrid(
+            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], np.radians(angles_deg), reach, indexing="ij",
+            sparse=True,
+        )  # fmt: skip
+        radius = distance / count
+        return self._inked(gap, near, hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle))
+
+    def _inked(self, gap: Gap, near: Bool[np.ndarray, "h w"], x: np.ndarray, y: np.ndarray) -> Bool[np.ndarray, "..."]:
+        """Return whether there is ink at places along and across a gap, relative to its width."""
+        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
+        along = end - start
+        columns = (start[0] + 1.0 + x * along[0] - y * along[1]).astype(np.intp)
+        rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
+        return near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
+
+    def _leaves_alone(self, gap: Gap) -> float:
+        """Return the width of leaves that stand open at a right angle without an arc, 0 if none is clear.
+
+        Such a leaf begins at a jamb and touches nothing else.
+        """
+        is_inked = self._around_hinges(gap, self._near, np.arange(74.0, 107.0, 2.0))
+        leaf, outer, tip = (is_inked[..., part].mean(axis=-1) for part in _RADII)
+        beside = np.maximum.reduce([part[..., k : k + 5] for part in (outer, tip) for k in (0, 12)])
+        ends = is_inked[..., 6:11, 25:].mean(axis=-1)
+        is_leaf = ((leaf[..., 6:11] >= _LEAF_ALONE) & (np.maximum(beside, ends) <= _BESIDE)).any(axis=(-2, -1))
+        # One leaf at either jamb, or two at both.
+        one, two = bool(is_leaf[0].any()), bool(is_leaf[1].all(axis=-1).any())
+        return gap.width if one else 0.5 * gap.width if two else 0.0
+
+    def _is_folded(self, gap: Gap) -> bool:
+        """Return whether the two leaves of a folding door stand before a jamb as two sides of a triangle."""
+        half, along = 0.5 * gap.shape.area / gap.width**2, np.linspace(0.04, 0.96, 24)
+        finest = 8.0 * self._ink.metres_per_pixel / self._finer / gap.width
+        feet, heights = np.linspace(max(0.12, finest), 1.0, 23), np.linspace(max(0.08, finest), 0.6, 14)
+        side, hinge, offset, foot, height, share = np.meshgrid(
+            [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], feet, heights, along, indexing="ij", sparse=True
+        )
+
+        def inked(relative: np.ndarray | float) -> Float[np.ndarray, "..."]:
+            y = offset + side * height * (1.0 - np.abs(2.0 * share - 1.0)) * relative
+            return self._inked(gap, self._near, hinge + (1.0 - 2.0 * hinge) * foot * share, y)
+
+        line, inside, outside = inked(1.0), inked(0.5)[..., 8:16], inked(1.5)[..., 8:16]
+        halves = np.minimum(line[..., :12].mean(axis=-1), line[..., 12:].mean(axis=-1))
+        is_free = np.maximum(inside.mean(axis=-1), outside.mean(axis=-1)) <= 0.1
+        return bool(((halves >= _LEAF_ALONE) & is_free).any())
 
     def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float, int]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
