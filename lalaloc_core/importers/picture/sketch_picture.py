@@ -16,9 +16,9 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.room_bounds import WallConfig
-from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
-from lalaloc_core.importers.drawing.sketch_drawing import is_between_rooms, split_named_rooms
+from lalaloc_core.importers.drawing.sketch_drawing import split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
@@ -34,7 +34,7 @@ _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 _LIKE_WALL = (0.4, 1.8)
 # Smallest such thickness beside a symbol that is drawn in part, and the share of that.
 _AS_WALL, _WEAK = 0.6, 0.8
-_MIN_ROOM_M2 = 0.8
+_MIN_ROOM_M2 = 0.5
 _MAX_ISLAND_M2 = 2.0
 # Smallest area (m²) and largest length (m) of a terrace, and its distance (m) from the rooms and from its name.
 _TERRACE, _AT_TERRACE_M = (1.5, 20.0), 1.0
@@ -160,10 +160,8 @@ def sketch_picture(
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
     # A gap away from all rooms lies between other strokes.
     gaps = [gap for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
-    openings = _openings(best, gaps, ink, builder, budget)
     garages = [shapely.Point(text.position) for text in letterings if "garage" in text.room_types]
-    reach_m = 0.5 * best.walls.thickness_m + _BESIDE_M
-    openings = _with_ways(openings, [*best.enclosed.rooms, *terraces], garages, reach_m, builder)
+    openings = _openings(best, gaps, terraces, garages, ink, builder, budget)
     fixtures = _fixtures(symbols, shapes, best, builder) if has_symbols else []
     # Faces of walls are the middles of their lines.
     pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
@@ -190,7 +188,7 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         is_bare = found.kind in ("leaf", "nothing") or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
         is_thick = _LIKE_WALL[0] * walls.thin_m <= depth_m <= _LIKE_WALL[1] * walls.thickness_m
-        is_passage = gap.is_sure and gap.width <= widest and is_thick
+        is_passage = gap.is_sure and gap.width <= widest and is_thick and reader.is_before_wall(gap)
         is_weak = found.confidence <= _WEAK and not (gap.is_sure and depth_m >= _AS_WALL * walls.thin_m)
         if (is_bare or is_weak) and not is_passage:
             return None
@@ -259,59 +257,67 @@ def _fixtures(
 
 
 def _openings(
-    reading: _Reading, gaps: Sequence[Gap], ink: Ink, builder: ReportBuilder, budget: Budget
+    reading: _Reading,
+    gaps: Sequence[Gap],
+    terraces: Sequence[shapely.Polygon],
+    garages: Sequence[shapely.Point],
+    ink: Ink,
+    builder: ReportBuilder,
+    budget: Budget,
 ) -> list[SketchedOpening]:
-    """Return the openings: gaps by their content and the rooms beside them, and windows drawn into walls."""
+    """Return the openings: gaps by their content and the areas beside them, and windows drawn into walls."""
     candidates = [(gap.start, gap.end, reading.contents[id(gap)]) for gap in gaps]
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
-    rooms, reach_m = shapely.STRtree(reading.enclosed.rooms), 0.5 * reading.walls.thickness_m + _BESIDE_M
+    rooms = reading.enclosed.rooms
+    areas, reach_m = [*rooms, *terraces], 0.5 * reading.walls.thickness_m + _BESIDE_M
+    sides = _sides([(start, end) for start, end, _ in candidates], reach_m, areas)
     placed = [
-        (content, math.dist(start, end), is_between_rooms(start, end, reach_m, rooms))
-        for start, end, content in candidates
+        (content, math.dist(start, end), sum(number < len(rooms) for number in own) == 2)
+        for (start, end, content), own in zip(candidates, sides, strict=True)
     ]
-    found, lines_of_doors = [], _lines_of_doors(placed)
-    for (start, end, _), (content, width, is_inner) in zip(candidates, placed, strict=True):
+    found, beside, lines_of_doors = list[SketchedOpening](), list[set[int]](), _lines_of_doors(placed)
+    for (start, end, _), (content, width, is_inner), own in zip(candidates, placed, sides, strict=True):
         budget.check_time()
+        if is_inner and len(set(own)) == 1 and content.kind in ("leaf", "nothing"):
+            continue  # Between a wall and furniture.
         kind = _kind(content, width, lines_of_doors, is_inner=is_inner)
         found.append(SketchedOpening(kind, start, end))
+        beside.append(set(own))
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
-    return found
-
-
-def _with_ways(
-    openings: Sequence[SketchedOpening],
-    areas: Sequence[shapely.Polygon],
-    garages: Sequence[shapely.Point],
-    reach_m: float,
-    builder: ReportBuilder,
-) -> list[SketchedOpening]:
-    """Return the openings with a door for every area that is reached by windows alone: the clearly widest.
-
-    These are sliding doors of closets and terraces, between two areas, and gates, from a garage to the outside.
-    """
-    found, lines = list(openings), np.array([(opening.start, opening.end) for opening in openings]).reshape(-1, 2, 2)
-    along = lines[:, 1] - lines[:, 0]
-    widths = np.hypot(*along.T)
-    step = reach_m * along[:, ::-1] * [-1.0, 1.0] / widths[:, None]
-    places = lines.mean(axis=1) + step * np.array([[[1.0]], [[-1.0]]])
-    beside: list[set[int]] = [set() for _ in found]
-    for place, area in shapely.STRtree(areas).query(shapely.points(places.reshape(-1, 2)), predicate="within").T:
-        beside[place % len(found)].add(int(area))
+    widths = [opening.line.length for opening in found]
     for number, area in enumerate(areas):
+        # Sliding doors of closets and terraces, and gates of garages, are drawn like windows.
         least_m = _GATE_M if any(map(area.covers, garages)) else 0.0
-        own = [k for k in range(len(found)) if number in beside[k] and widths[k] >= least_m]
-        panes = [k for k in own if found[k].kind == "window" and (least_m or len(beside[k]) > 1)]
-        widest = max(panes, key=lambda k: widths[k], default=-1)
-        is_only = all(widths[k] <= _NARROWER * widths[widest] for k in panes if k != widest)
-        if panes and is_only and all(found[k].kind == "window" for k in own):
+        wide = [k for k, own in enumerate(beside) if number in own and widths[k] >= least_m]
+        panes = [k for k in wide if least_m or len(beside[k]) > 1]
+        if any(found[k].kind != "window" for k in wide) or not panes:
+            continue
+        *others, widest = sorted(panes, key=lambda k: widths[k])
+        if all(widths[k] <= _NARROWER * widths[widest] for k in others):
             found[widest] = replace(found[widest], kind="door")
-            place = f"({found[widest].start[0]:.2f}, {found[widest].start[1]:.2f})"
-            builder.unsure.append(f"a window of {widths[widest]:.2f} m at {place} is taken for a door: no other is there")
+            position = f"({found[widest].start[0]:.2f}, {found[widest].start[1]:.2f})"
+            builder.unsure.append(
+                f"a window of {widths[widest]:.2f} m at {position} is taken for a door, as no other leads there"
+            )
     return found
+
+
+def _sides(
+    lines: Sequence[tuple[Point, Point]], reach_m: float, areas: Sequence[shapely.Polygon]
+) -> list[list[int]]:
+    """Return the numbers of the areas at this distance to both sides of each line; it can be the same area."""
+    ends = np.array(lines, dtype=float).reshape(-1, 2, 2)
+    along = ends[:, 1] - ends[:, 0]
+    step = reach_m * along[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    places = shapely.points(np.concatenate([ends.mean(axis=1) + step, ends.mean(axis=1) - step]))
+    sides: list[list[int]] = [[] for _ in lines]
+    for place, area in shapely.STRtree(areas).query(places, predicate="within").T.tolist():
+        sides[place % len(lines)].append(area)
+    return sides
 
 
 def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:

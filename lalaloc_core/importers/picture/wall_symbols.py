@@ -65,7 +65,7 @@ class GapReader:
     """Classifier of the gaps of one picture."""
 
     def __init__(self, ink: Ink, walls: WallMask) -> None:
-        self._ink = ink
+        self._ink, self._walls = ink, walls.mask
         # Arcs of few pixels are compared on a finer picture: their lines would cover what is drawn beside them.
         self._finer = math.ceil(ink.metres_per_pixel / _COARSE_M)
         gray, inked, wall = (
@@ -108,6 +108,14 @@ class GapReader:
         if leaf_m or (_DOOR_M[0] <= gap.width <= _DOOR_M[1] and self._is_folded(gap)):
             return GapContent("leaf", _ARC, leaf_m=leaf_m)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
+
+    def is_before_wall(self, gap: Gap) -> bool:
+        """Return whether the gap begins at a wall of its own thickness, not at the side of a short piece of wall."""
+        first, last, _, across, _ = shapely.get_coordinates(gap.shape)
+        behind = first - 0.5 * math.dist(first, last) * (across - first) / math.dist(first, across)
+        places = self._ink.to_pixels(behind + np.array([[0.15], [0.5], [0.85]]) * (last - first)).astype(np.intp)
+        rows, columns = (places[:, k].clip(0, self._walls.shape[1 - k] - 1) for k in (1, 0))
+        return bool(self._walls[rows, columns].all())
 
     def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int]:
         """Return the drawn share of the best symbol of a door in a gap, and the number of its leaves.
