@@ -11,12 +11,20 @@ import cv2
 import numpy as np
 import shapely
 from jaxtyping import UInt8
+from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.room_bounds import WallConfig
-from lalaloc_core.importers.common.sketch import OpeningKind, Point, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.sketch import (
+    OpeningKind,
+    Point,
+    Sketch,
+    SketchedFixture,
+    SketchedOpening,
+    SketchedRoom,
+)
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
 from lalaloc_core.importers.drawing.sketch_drawing import split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
@@ -271,7 +279,9 @@ def _openings(
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
     rooms = reading.enclosed.rooms
-    areas, reach_m = [*rooms, *terraces], 0.5 * reading.walls.thickness_m + _BESIDE_M
+    # Leaves that open onto a terrace are cut out of it.
+    outside = [terrace.convex_hull.difference(shapely.union_all(rooms)) for terrace in terraces]
+    areas, reach_m = [*rooms, *outside], 0.5 * reading.walls.thickness_m + _BESIDE_M
     sides = _sides([(start, end) for start, end, _ in candidates], reach_m, areas)
     placed = [
         (content, math.dist(start, end), sum(number < len(rooms) for number in own) == 2)
@@ -306,9 +316,7 @@ def _openings(
     return found
 
 
-def _sides(
-    lines: Sequence[tuple[Point, Point]], reach_m: float, areas: Sequence[shapely.Polygon]
-) -> list[list[int]]:
+def _sides(lines: Sequence[tuple[Point, Point]], reach_m: float, areas: Sequence[BaseGeometry]) -> list[list[int]]:
     """Return the numbers of the areas at this distance to both sides of each line; it can be the same area."""
     ends = np.array(lines, dtype=float).reshape(-1, 2, 2)
     along = ends[:, 1] - ends[:, 0]

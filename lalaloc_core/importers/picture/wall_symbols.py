@@ -144,7 +144,9 @@ class GapReader:
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
         return (two, 2) if two > one else (one, 1)
 
-    def _around_hinges(self, gap: Gap, near: Bool[np.ndarray, "h w"], angles_deg: np.ndarray) -> Bool[np.ndarray, "..."]:
+    def _around_hinges(
+        self, gap: Gap, near: Bool[np.ndarray, "h w"], angles_deg: np.ndarray
+    ) -> Bool[np.ndarray, "..."]:
         """Return what is inked around the hinges that one or two leaves can have, up to 1.24 times their width.
 
         Axes are the number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
@@ -155,7 +157,9 @@ class GapReader:
             sparse=True,
         )  # fmt: skip
         radius = distance / count
-        return self._inked(gap, near, hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle))
+        return self._inked(
+            gap, near, hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle)
+        )
 
     def _inked(self, gap: Gap, near: Bool[np.ndarray, "h w"], x: np.ndarray, y: np.ndarray) -> Bool[np.ndarray, "..."]:
         """Return whether there is ink at places along and across a gap, relative to its width."""
