@@ -149,6 +149,7 @@ class GapReader:
     ) -> Bool[np.ndarray, "..."]:
         """Return what is inked around the hinges that one or two leaves can have, up to 1.24 times their width.
 
+        What lies within the wall is not, as the lines of a window would match any arc.
         Axes are the number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
         """
         half, reach = 0.5 * gap.shape.area / gap.width**2, np.arange(0.16, 1.25, 0.04)
@@ -157,9 +158,8 @@ class GapReader:
             sparse=True,
         )  # fmt: skip
         radius = distance / count
-        return self._inked(
-            gap, near, hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle)
-        )
+        x, y = hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle)
+        return self._inked(gap, near, x, y) & (np.abs(y) > half)
 
     def _inked(self, gap: Gap, near: Bool[np.ndarray, "h w"], x: np.ndarray, y: np.ndarray) -> Bool[np.ndarray, "..."]:
         """Return whether there is ink at places along and across a gap, relative to its width."""
