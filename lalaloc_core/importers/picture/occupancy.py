@@ -159,9 +159,10 @@ def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h
 
 
 def _is_floor(mask: Bool[np.ndarray, "h w"], cell_m: float) -> bool:
-    """Return whether an area is wide somewhere, apart from lines over it."""
+    """Return whether an area is wide nearly everywhere, apart from lines over it; walls are so at corners alone."""
     inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
-    return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
+    is_wide = _near(inside, 2.0 * _INSIDE_M / cell_m)
+    return bool(inside.any()) and min(mask[inside].mean(), is_wide[mask].mean()) >= _EVEN
 
 
 def _lines_around(

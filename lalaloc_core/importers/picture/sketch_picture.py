@@ -39,7 +39,7 @@ _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.0
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 # Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
-_LIKE_WALL = (0.4, 1.8)
+_LIKE_WALL = (0.7, 1.8)
 # Smallest such thickness beside a symbol that is drawn in part, and the share of that.
 _AS_WALL, _WEAK = 0.6, 0.8
 _MIN_ROOM_M2 = 0.5

@@ -18,7 +18,7 @@ from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
 # Share of the walls, by area, that is thinner than thin ones.
-_THIN_WALLS = 0.05
+_THIN_WALLS = 0.08
 # Broadest strokes and leaves between two lines relative to walls, with the thinnest inner wall (m) beside them.
 _STROKE, _LEAF = (0.4, 0.075), (0.55, 0.1)
 # Largest white gap between the two lines of a wall; the sector of a door swing is wider.
