@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -15,10 +15,11 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float
 
-from lalaloc_core.importers.common.geometry import opening_line, side_lengths
+from lalaloc_core.importers.common.geometry import opening_line
 from lalaloc_core.importers.common.sketch import SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, faint_lines
+from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
 # Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (m), at least a pixel.
@@ -39,7 +40,8 @@ _FAINT, _DIP, _RISE, _OF_DEPTH, _HAIRLINE = 22.0, 30.0, 12.0, 0.25, 12.0
 # A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular.
 _MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
 _FULL, _LONG = 0.8, 3.0
-_SLANTED_DEG = 8.0
+# Smallest cosine of two parallel strips, and number of panes of a window: hatches have more strips.
+_PARALLEL, _PANES = 0.99, (2, 5)
 
 
 @dataclass(frozen=True)
@@ -263,62 +265,35 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) 
     """Return the windows: groups of panes that lie side by side in a wall. `check_time` raises an exception to stop."""
     if walls.cavities is None:
         return []
-    panes = _panes(walls, ink, check_time)
+    # Cavities outside the walls are furniture.
+    cavities = replace(ink, mask=~(walls.mask & (walls.cavities > 0)))
+    thinnest_m, thickest_m = (share * walls.thickness_m for share in _OF_WALL)
+    panes = [
+        strip
+        for strip in closed_shapes(cavities, (_FULL * _MIN_LENGTH_M * thinnest_m, math.inf))
+        if strip.long_m >= max(_MIN_LENGTH_M, _LONG * strip.short_m)
+        and thinnest_m <= strip.short_m - ink.metres_per_pixel <= thickest_m
+        and strip.filled >= _FULL
+    ]
     found: list[SketchedOpening] = []
     while panes:
         check_time()
-        (first, angle), *others = panes
-        group, panes = [first], []
-        for second, second_angle in others:
-            apart = abs((angle - second_angle + 90.0) % 180.0 - 90.0)
-            if apart < _SLANTED_DEG and _side_by_side(group[-1], second, ink, walls):
-                group.append(second)
-            else:
-                panes.append((second, second_angle))
-        if len(group) >= 2:
-            ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
+        group = [panes[0]]
+        for pane in panes[1:]:
+            if _side_by_side(group[-1], pane, 0.5 * walls.thickness_m):
+                group.append(pane)
+        panes = [pane for pane in panes if pane not in group]
+        if _PANES[0] <= len(group) <= _PANES[1]:
+            ends = opening_line(shapely.Polygon(Shape.around(group).box))
             assert ends is not None
             found.append(SketchedOpening("window", *ends))
     return found
 
 
-def _panes(walls: WallMask, ink: Ink, check_time: Callable[[], None]) -> list[tuple[np.ndarray, float]]:
-    """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
-    assert walls.cavities is not None
-    # Cavities outside the walls are furniture.
-    rows, columns = np.nonzero(np.where(walls.mask, walls.cavities, 0))
-    labels = walls.cavities[rows, columns]
-    order = np.argsort(labels, kind="stable")
-    points, begins = np.column_stack([columns, rows])[order], np.flatnonzero(np.diff(labels[order], prepend=0))
-    sizes, pixel_m = np.diff(begins, append=len(points)), ink.metres_per_pixel
-    thickness = walls.thickness_m / pixel_m
-    found = []
-    # Most cavities are tiny.
-    large = sizes * pixel_m >= _FULL * _MIN_LENGTH_M
-    for begin, size in zip(begins[large].tolist(), sizes[large].tolist(), strict=True):
-        part = points[begin : begin + size]
-        if (np.ptp(part, axis=0).max() + 1) * pixel_m < _MIN_LENGTH_M:
-            continue
-        check_time()
-        x0, y0 = part.min(axis=0).tolist()
-        (cx, cy), (width, height), angle = cv2.minAreaRect((part - [x0, y0]).astype(np.float32))
-        width, height = width + 1.0, height + 1.0
-        long, short = max(width, height), min(width, height)
-        if long * pixel_m < _MIN_LENGTH_M or long < _LONG * short:
-            continue
-        if not _OF_WALL[0] * thickness <= short <= _OF_WALL[1] * thickness or size < _FULL * long * short:
-            continue
-        corners = cv2.boxPoints(((cx + x0 + 0.5, cy + y0 + 0.5), (width, height), angle))
-        found.append((corners, angle if width >= height else angle + 90.0))
-    return found
-
-
-def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMask) -> bool:
-    """Return whether two strips lie along each other, one line apart."""
-    a, b = shapely.Polygon(first), shapely.Polygon(second)
-    line = 0.5 * walls.thickness_m / ink.metres_per_pixel
-    if shapely.distance(a, b) > line:
+def _side_by_side(first: Shape, second: Shape, line_m: float) -> bool:
+    """Return whether two strips lie along each other, at most a line apart."""
+    if shapely.distance(first.outline, second.outline) > line_m or abs(float(first.axis @ second.axis)) < _PARALLEL:
         return False
-    lengths = sorted(side_lengths(strip)[1] for strip in (a, b))
-    shared = a.buffer(line, cap_style="square", join_style="mitre").intersection(b)
-    return lengths[0] > 0.8 * lengths[1] and shared.length > lengths[0]
+    shared = first.outline.buffer(line_m, cap_style="square", join_style="mitre").intersection(second.outline)
+    shorter, longer = sorted((first.long_m, second.long_m))
+    return shorter > 0.8 * longer and shared.length > shorter
