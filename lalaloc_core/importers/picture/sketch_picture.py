@@ -11,22 +11,15 @@ import cv2
 import numpy as np
 import shapely
 from jaxtyping import UInt8
-from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.opening_trust import reached_rooms
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import polygons_from_geometry
 from lalaloc_core.importers.common.room_bounds import WallConfig
-from lalaloc_core.importers.common.sketch import (
-    OpeningKind,
-    Point,
-    Sketch,
-    SketchedFixture,
-    SketchedOpening,
-    SketchedRoom,
-)
+from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedFixture, SketchedOpening, SketchedRoom
 from lalaloc_core.importers.drawing.enclosed_rooms import Enclosed, Gap, enclose
-from lalaloc_core.importers.drawing.sketch_drawing import split_named_rooms
+from lalaloc_core.importers.drawing.sketch_drawing import is_between_rooms, split_named_rooms
 from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
@@ -91,13 +84,11 @@ class _Reading:
         """Return whether this reading has all rooms of another one and more."""
         if self.area_m2 < smaller.area_m2 + _MIN_ROOM_M2 or not smaller.enclosed.rooms:
             return False
-        tree = shapely.STRtree(self.enclosed.rooms)
-        for room in smaller.enclosed.rooms:
-            near = tree.geometries[tree.query(room, predicate="intersects")]
-            shared = shapely.area(shapely.intersection(near, room))
-            if not (shared >= _SAME_ROOM * (shapely.area(near) + room.area - shared)).any():
-                return False
-        return True
+        known, found = np.array(smaller.enclosed.rooms), np.array(self.enclosed.rooms)
+        a, b = shapely.STRtree(found).query(known, predicate="intersects")
+        shared = shapely.area(shapely.intersection(known[a], found[b]))
+        is_same = shared >= _SAME_ROOM * (shapely.area(known[a]) + shapely.area(found[b]) - shared)
+        return len(np.unique(a[is_same])) == len(known)
 
     def divided(self, letterings: Sequence[Lettering], budget: Budget) -> _Reading:
         """Return the reading with rooms that have several names divided at passages wider than a door."""
@@ -278,23 +269,23 @@ def _openings(
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
         candidates += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
-    rooms = reading.enclosed.rooms
-    # Leaves that open onto a terrace are cut out of it.
-    outside = [terrace.convex_hull.difference(shapely.union_all(rooms)) for terrace in terraces]
-    areas, reach_m = [*rooms, *outside], 0.5 * reading.walls.thickness_m + _BESIDE_M
-    sides = _sides([(start, end) for start, end, _ in candidates], reach_m, areas)
+    rooms, reach_m = shapely.STRtree(reading.enclosed.rooms), 0.5 * reading.walls.thickness_m + _BESIDE_M
     placed = [
-        (content, math.dist(start, end), sum(number < len(rooms) for number in own) == 2)
-        for (start, end, content), own in zip(candidates, sides, strict=True)
+        (content, math.dist(start, end), is_between_rooms(start, end, reach_m, rooms))
+        for start, end, content in candidates
     ]
-    found, beside, lines_of_doors = list[SketchedOpening](), list[set[int]](), _lines_of_doors(placed)
-    for (start, end, _), (content, width, is_inner), own in zip(candidates, placed, sides, strict=True):
+    # Leaves that open onto a terrace are cut out of it.
+    around = [terrace.convex_hull.difference(shapely.union_all(rooms.geometries)) for terrace in terraces]
+    areas = [*reading.enclosed.rooms, *around]
+    found, beside, lines_of_doors = list[SketchedOpening](), list[list[int]](), _lines_of_doors(placed)
+    for (start, end, _), (content, width, is_inner) in zip(candidates, placed, strict=True):
         budget.check_time()
-        if is_inner and len(set(own)) == 1 and content.kind in ("leaf", "nothing"):
-            continue  # Between a wall and furniture.
         kind = _kind(content, width, lines_of_doors, is_inner=is_inner)
+        own = reached_rooms(areas, [shapely.LineString([start, end])])
+        if is_inner and len(own) < 2 and content.kind in ("leaf", "nothing"):
+            continue  # Between a wall and furniture.
         found.append(SketchedOpening(kind, start, end))
-        beside.append(set(own))
+        beside.append(own)
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
@@ -303,29 +294,13 @@ def _openings(
         # Sliding doors of closets and terraces, and gates of garages, are drawn like windows.
         least_m = _GATE_M if any(map(area.covers, garages)) else 0.0
         wide = [k for k, own in enumerate(beside) if number in own and widths[k] >= least_m]
-        panes = [k for k in wide if least_m or len(beside[k]) > 1]
-        if any(found[k].kind != "window" for k in wide) or not panes:
-            continue
-        *others, widest = sorted(panes, key=lambda k: widths[k])
-        if all(widths[k] <= _NARROWER * widths[widest] for k in others):
-            found[widest] = replace(found[widest], kind="door")
-            position = f"({found[widest].start[0]:.2f}, {found[widest].start[1]:.2f})"
-            builder.unsure.append(
-                f"a window of {widths[widest]:.2f} m at {position} is taken for a door, as no other leads there"
-            )
+        panes = sorted((k for k in wide if least_m or len(beside[k]) > 1), key=lambda k: widths[k])
+        is_clear = len(panes) == 1 or (len(panes) > 1 and widths[panes[-2]] <= _NARROWER * widths[panes[-1]])
+        if is_clear and all(found[k].kind == "window" for k in wide):
+            gate = found[panes[-1]] = replace(found[panes[-1]], kind="door")
+            position = f"({gate.start[0]:.2f}, {gate.start[1]:.2f})"
+            builder.unsure.append(f"a window at {position} is taken for a door, as no other leads there")
     return found
-
-
-def _sides(lines: Sequence[tuple[Point, Point]], reach_m: float, areas: Sequence[BaseGeometry]) -> list[list[int]]:
-    """Return the numbers of the areas at this distance to both sides of each line; it can be the same area."""
-    ends = np.array(lines, dtype=float).reshape(-1, 2, 2)
-    along = ends[:, 1] - ends[:, 0]
-    step = reach_m * along[:, ::-1] * [-1.0, 1.0] / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
-    places = shapely.points(np.concatenate([ends.mean(axis=1) + step, ends.mean(axis=1) - step]))
-    sides: list[list[int]] = [[] for _ in lines]
-    for place, area in shapely.STRtree(areas).query(places, predicate="within").T.tolist():
-        sides[place % len(lines)].append(area)
-    return sides
 
 
 def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:

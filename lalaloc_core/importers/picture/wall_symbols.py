@@ -28,8 +28,6 @@ _NEAR_M, _COARSE_M = 0.017, 0.02
 _DOOR_M = (0.5, 2.4)
 # Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
 _LEAF_ALONE, _BESIDE = 0.95, 0.45
-# Parts of a leaf around its hinge: all of it, the outer half, and the tip.
-_RADII = slice(21), slice(9, 20), slice(19, 23)
 # Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
 _BROKEN, _BROKEN_QUARTER = 0.35, 0.15
 # Widths of bow windows (m), and their smallest and largest depths relative to them.
@@ -83,11 +81,11 @@ class GapReader:
 
     def classify(self, gap: Gap) -> GapContent:
         """Return the most likely content of a gap."""
-        swing, leaves = 0.0, 1
-        if _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
-            swing, leaves = self._swing(gap, self._near)
+        swing, leaves, alone = 0.0, 1, 0
+        if is_door := _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
+            swing, leaves, alone = self._swing(gap, self._near)
             if swing < _ARC:
-                swing, leaves = self._swing(gap, self._near_hairlines, is_pale=True)
+                swing, leaves, _ = self._swing(gap, self._near_hairlines, is_pale=True)
         found = GapContent("swing", swing, leaf_m=gap.width / leaves)
         if swing > _ARC and leaves == 1:
             return found
@@ -106,9 +104,8 @@ class GapReader:
             return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
             return GapContent("line", share, warmth, lines)
-        leaf_m = self._leaves_alone(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
-        if leaf_m or (_DOOR_M[0] <= gap.width <= _DOOR_M[1] and self._is_folded(gap)):
-            return GapContent("leaf", _ARC, leaf_m=leaf_m)
+        if alone or (is_door and self._is_folded(gap)):
+            return GapContent("leaf", _ARC, leaf_m=gap.width / alone if alone else 0.0)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
     def is_before_wall(self, gap: Gap) -> bool:
@@ -119,49 +116,44 @@ class GapReader:
         rows, columns = (places[:, k].clip(0, self._walls.shape[1 - k] - 1) for k in (1, 0))
         return bool(self._walls[rows, columns].all())
 
-    def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int]:
-        """Return the drawn share of the best symbol of a door in a gap, and the number of its leaves.
+    def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int, int]:
+        """Return the drawn share of the best symbol of a door in a gap, its leaves, and the leaves without an arc.
 
-        It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
-        leaf alone. A pale arc must stand out from what is drawn beside it.
+        The symbol is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open. A
+        pale arc must stand out from what is drawn beside it, and a leaf without an arc touches nothing. What lies
+        within the wall is not compared: the lines of a window would match any arc.
         """
-        is_inked = self._around_hinges(gap, near, np.arange(12.0, 91.0, 2.0))
+        half, reach = 0.5 * gap.shape.area / gap.width**2, np.arange(0.16, 1.25, 0.04)
+        # Number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
+        count, side, hinge, offset, angle, distance = np.meshgrid(
+            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], np.radians(np.arange(12.0, 103.0, 2.0)), reach,
+            indexing="ij", sparse=True,
+        )  # fmt: skip
+        x = hinge + (1.0 - 2.0 * hinge) * distance / count * np.cos(angle)
+        y = offset + side * distance / count * np.sin(angle)
+        is_inked = self._inked(gap, near, x, y) & (np.abs(y) > half)
         # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
         arcs, leaves = is_inked[..., :36, 19:23], is_inked[..., :21].mean(axis=-1)
         shares = arcs.mean(axis=-2)
         if is_pale:
             beside = np.maximum(is_inked[..., :36, 15:19].mean(axis=-2), is_inked[..., :36, 23:27].mean(axis=-2))
             shares = np.where(beside <= _BESIDE, shares, 0.0)
-        has_leaf = (shares >= _ARC_WITH_LEAF) & (leaves[..., -1:] >= _LEAF)
+        has_leaf = (shares >= _ARC_WITH_LEAF) & (leaves[..., 39:40] >= _LEAF)
         shares = np.where(has_leaf, np.maximum(shares, _ARC), shares)
-        # Leaves at 24 to 76 degrees, and the arc up to six degrees before each.
+        # Leaves at 24 to 90 degrees with nothing beside them, and the arc up to six degrees before those to 76 degrees.
+        outer, tips = is_inked[..., 9:21].mean(axis=-1), is_inked[..., 19:23].mean(axis=-1)
+        beside, at_tip = (np.maximum(part[..., :34], part[..., 12:]) for part in (outer, tips))
+        is_free = np.maximum(beside, is_inked[..., 6:40, 25:].mean(axis=-1)) <= _BESIDE
         up_to = (np.cumsum(arcs, axis=-2) / np.arange(1, 37)[:, None])[..., 3:30, :].max(axis=-1)
-        leaf, outer = leaves[..., 6:33], is_inked[..., 9:21].mean(axis=-1)
-        beside = np.maximum(outer[..., :27], outer[..., 12:39])
-        ends = is_inked[..., 6:33, 24:].mean(axis=-1) <= _BESIDE
-        is_slanted = (beside <= _BESIDE) & ends & (leaf >= np.where(up_to >= _ARC, _LEAF, _LEAF_ALONE))
-        slanted = np.where(is_slanted, np.maximum(0.5 * (leaf + up_to), _ARC), 0.0)
+        leaf = leaves[..., 6:33]
+        is_slanted = is_free[..., :27] & (up_to >= _ARC) & (leaf >= _LEAF)
+        slanted = np.where(is_slanted, 0.5 * (leaf + up_to), 0.0)
         best = np.maximum(shares.max(axis=(-2, -1)), slanted.max(axis=(-2, -1)))
+        alone = (is_free & (at_tip <= _BESIDE) & (leaves[..., 6:40] >= _LEAF_ALONE)).any(axis=(-2, -1))
         # Both of two leaves must be visible.
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
-        return (two, 2) if two > one else (one, 1)
-
-    def _around_hinges(
-        self, gap: Gap, near: Bool[np.ndarray, "h w"], angles_deg: np.ndarray
-    ) -> Bool[np.ndarray, "..."]:
-        """Return what is inked around the hinges that one or two leaves can have, up to 1.24 times their width.
-
-        What lies within the wall is not, as the lines of a window would match any arc.
-        Axes are the number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
-        """
-        half, reach = 0.5 * gap.shape.area / gap.width**2, np.arange(0.16, 1.25, 0.04)
-        count, side, hinge, offset, angle, distance = np.meshgrid(
-            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], np.radians(angles_deg), reach, indexing="ij",
-            sparse=True,
-        )  # fmt: skip
-        radius = distance / count
-        x, y = hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle), offset + side * radius * np.sin(angle)
-        return self._inked(gap, near, x, y) & (np.abs(y) > half)
+        without_arc = 1 if alone[0].any() else 2 * int(alone[1].all(axis=-1).any())
+        return (two, 2, without_arc) if two > one else (one, 1, without_arc)
 
     def _inked(self, gap: Gap, near: Bool[np.ndarray, "h w"], x: np.ndarray, y: np.ndarray) -> Bool[np.ndarray, "..."]:
         """Return whether there is ink at places along and across a gap, relative to its width."""
@@ -171,37 +163,28 @@ class GapReader:
         rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
         return near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
 
-    def _leaves_alone(self, gap: Gap) -> float:
-        """Return the width of leaves that stand open at a right angle without an arc, 0 if none is clear.
-
-        Such a leaf begins at a jamb and touches nothing else.
-        """
-        is_inked = self._around_hinges(gap, self._near, np.arange(74.0, 107.0, 2.0))
-        leaf, outer, tip = (is_inked[..., part].mean(axis=-1) for part in _RADII)
-        beside = np.maximum.reduce([part[..., k : k + 5] for part in (outer, tip) for k in (0, 12)])
-        ends = is_inked[..., 6:11, 25:].mean(axis=-1)
-        is_leaf = ((leaf[..., 6:11] >= _LEAF_ALONE) & (np.maximum(beside, ends) <= _BESIDE)).any(axis=(-2, -1))
-        # One leaf at either jamb, or two at both.
-        one, two = bool(is_leaf[0].any()), bool(is_leaf[1].all(axis=-1).any())
-        return gap.width if one else 0.5 * gap.width if two else 0.0
-
     def _is_folded(self, gap: Gap) -> bool:
         """Return whether the two leaves of a folding door stand before a jamb as two sides of a triangle."""
         half, along = 0.5 * gap.shape.area / gap.width**2, np.linspace(0.04, 0.96, 24)
         finest = 8.0 * self._ink.metres_per_pixel / self._finer / gap.width
         feet, heights = np.linspace(max(0.12, finest), 1.0, 23), np.linspace(max(0.08, finest), 0.6, 14)
-        side, hinge, offset, foot, height, share = np.meshgrid(
-            [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], feet, heights, along, indexing="ij", sparse=True
+        # The lines of the triangles, and those inside and around them, which are free.
+        side, hinge, offset, foot, height, relative, share = np.meshgrid(
+            [1.0, -1.0],
+            [0.0, 1.0],
+            [half, 0.0, -half],
+            feet,
+            heights,
+            [1.0, 0.5, 1.5],
+            along,
+            indexing="ij",
+            sparse=True,
         )
-
-        def inked(relative: np.ndarray | float) -> Float[np.ndarray, "..."]:
-            y = offset + side * height * (1.0 - np.abs(2.0 * share - 1.0)) * relative
-            return self._inked(gap, self._near, hinge + (1.0 - 2.0 * hinge) * foot * share, y)
-
-        line, inside, outside = inked(1.0), inked(0.5)[..., 8:16], inked(1.5)[..., 8:16]
-        halves = np.minimum(line[..., :12].mean(axis=-1), line[..., 12:].mean(axis=-1))
-        is_free = np.maximum(inside.mean(axis=-1), outside.mean(axis=-1)) <= 0.1
-        return bool(((halves >= _LEAF_ALONE) & is_free).any())
+        y = offset + side * height * relative * (1.0 - np.abs(2.0 * share - 1.0))
+        is_inked = self._inked(gap, self._near, hinge + (1.0 - 2.0 * hinge) * foot * share, y)
+        leaves, others = is_inked[..., 0, :].reshape(*is_inked.shape[:-2], 2, 12), is_inked[..., 1:, 8:16]
+        is_drawn = leaves.mean(axis=-1).min(axis=-1) >= _LEAF_ALONE
+        return bool((is_drawn & (others.mean(axis=-1).max(axis=-1) <= 0.1)).any())
 
     def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float, int]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
