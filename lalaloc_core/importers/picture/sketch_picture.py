@@ -31,10 +31,9 @@ from lalaloc_core.importers.picture.wall_symbols import GapContent, GapReader, w
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05, shallowest_room=0.4, widest_pier=1.2)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
-# Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
-_LIKE_WALL = (0.7, 1.8)
-# Smallest such thickness beside a symbol that is drawn in part, and the share of that.
-_AS_WALL, _WEAK = 0.6, 0.8
+# Thickness of the ends of walls beside a gap: least share of thin walls, and largest share of the usual beside an empty
+# one; other ends are of furniture. Share of a symbol that is drawn in part.
+_LIKE_WALL, _WEAK = (0.6, 1.5), 0.8
 _MIN_ROOM_M2 = 0.5
 _MAX_ISLAND_M2 = 2.0
 # Smallest area (m²) and largest length (m) of a terrace, and its distance (m) from the rooms and from its name.
@@ -186,10 +185,9 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind in ("leaf", "nothing") or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
-        is_thick = _LIKE_WALL[0] * walls.thin_m <= depth_m <= _LIKE_WALL[1] * walls.thickness_m
-        is_passage = gap.is_sure and gap.width <= widest and is_thick and reader.is_before_wall(gap)
-        is_weak = found.confidence <= _WEAK and not (gap.is_sure and depth_m >= _AS_WALL * walls.thin_m)
-        if (is_bare or is_weak) and not is_passage:
+        is_sure = gap.is_sure and depth_m >= _LIKE_WALL[0] * walls.thin_m
+        is_passage = is_sure and gap.width <= widest and depth_m <= _LIKE_WALL[1] * walls.thickness_m
+        if (is_bare and not is_passage) or (found.confidence <= _WEAK and not is_sure):
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None

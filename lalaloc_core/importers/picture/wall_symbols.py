@@ -65,7 +65,7 @@ class GapReader:
     """Classifier of the gaps of one picture."""
 
     def __init__(self, ink: Ink, walls: WallMask) -> None:
-        self._ink, self._walls = ink, walls.mask
+        self._ink = ink
         # Arcs of few pixels are compared on a finer picture: their lines would cover what is drawn beside them.
         self._finer = math.ceil(ink.metres_per_pixel / _COARSE_M)
         gray, inked, wall = (
@@ -108,14 +108,6 @@ class GapReader:
             return GapContent("leaf", _ARC, leaf_m=gap.width / alone if alone else 0.0)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
-    def is_before_wall(self, gap: Gap) -> bool:
-        """Return whether the gap begins at a wall of its own thickness, not at the side of a short piece of wall."""
-        first, last, _, across, _ = shapely.get_coordinates(gap.shape)
-        behind = first - 0.5 * math.dist(first, last) * (across - first) / math.dist(first, across)
-        places = self._ink.to_pixels(behind + np.array([[0.15], [0.5], [0.85]]) * (last - first)).astype(np.intp)
-        rows, columns = (places[:, k].clip(0, self._walls.shape[1 - k] - 1) for k in (1, 0))
-        return bool(self._walls[rows, columns].all())
-
     def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int, int]:
         """Return the drawn share of the best symbol of a door in a gap, its leaves, and the leaves without an arc.
 
@@ -131,9 +123,11 @@ class GapReader:
         )  # fmt: skip
         x = hinge + (1.0 - 2.0 * hinge) * distance / count * np.cos(angle)
         y = offset + side * distance / count * np.sin(angle)
-        is_inked = self._inked(gap, near, x, y) & (np.abs(y) > half)
+        is_outside = np.abs(y) > half
+        is_inked = self._inked(gap, near, x, y) & is_outside
         # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
-        arcs, leaves = is_inked[..., :36, 19:23], is_inked[..., :21].mean(axis=-1)
+        arcs = is_inked[..., :36, 19:23]
+        leaves = is_inked[..., :21].mean(axis=-1)
         shares = arcs.mean(axis=-2)
         if is_pale:
             beside = np.maximum(is_inked[..., :36, 15:19].mean(axis=-2), is_inked[..., :36, 23:27].mean(axis=-2))
