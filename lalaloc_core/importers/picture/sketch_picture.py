@@ -24,7 +24,14 @@ from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import FINEST_M, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
-from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
+from lalaloc_core.importers.picture.wall_mask import (
+    WallMask,
+    align_edges,
+    dark_walls,
+    outlined_walls,
+    usual_thickness,
+    wall_polygons,
+)
 from lalaloc_core.importers.picture.wall_symbols import GapContent, GapReader, windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
@@ -32,8 +39,8 @@ _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.0
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 # Thickness of the ends of walls beside a gap: least share of thin walls, and largest share of the usual beside an empty
-# one; other ends are of furniture. Share of a symbol that is drawn in part.
-_LIKE_WALL, _WEAK = (0.6, 1.5), 0.8
+# one; other ends are of furniture. Share of the walls that thin ones have, and of a symbol that is drawn in part.
+_LIKE_WALL, _THIN, _WEAK = (0.6, 1.5), 0.08, 0.8
 _MIN_ROOM_M2 = 0.5
 _MAX_ISLAND_M2 = 2.0
 # Smallest area (m²) and largest length (m) of a terrace, and its distance (m) from the rooms and from its name.
@@ -51,10 +58,9 @@ _RECALL = 0.95
 _CLOSING_M, _CLEARANCE_M, _COVERED, _MAX_NAMED = 1.5, 0.2, 0.9, 5
 _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M, _THICK_M = 1.2, 0.6
-# Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
-_WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
-# Least width of the gate of a garage (m), and width of windows relative to a clearly wider one.
-_GATE_M, _NARROWER = 2.0, 0.8
+# Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it. Least width of the
+# gate of a garage, and width of windows relative to a clearly wider one.
+_WIDEST_DOOR_M, _BESIDE_M, _GATE_M, _NARROWER = 1.3, 0.25, 2.0, 0.8
 # Least number of doors that are drawn without a swing, least share of other openings that have more lines, and share of
 # a line that is drawn: dashes in an inner wall are a beam.
 _DOORS_ALIKE, _UNLIKE, _DASHED = 3, 0.5, 0.7
@@ -179,13 +185,15 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     budget.begin(f"finding rooms between {'dark walls' if is_dark else 'outlined walls'}")
     reader = GapReader(ink, walls)
     contents: dict[int, GapContent] = {}
+    # Inner walls can be a third as thick as outer ones.
+    thin_m = usual_thickness(walls.mask.astype(np.uint8), _THIN) * ink.metres_per_pixel
 
     def rank(gap: Gap) -> int | None:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind in ("leaf", "nothing") or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
-        is_sure = gap.is_sure and depth_m >= _LIKE_WALL[0] * walls.thin_m
+        is_sure = gap.is_sure and depth_m >= _LIKE_WALL[0] * thin_m
         is_passage = is_sure and gap.width <= widest and depth_m <= _LIKE_WALL[1] * walls.thickness_m
         if (is_bare and not is_passage) or (found.confidence <= _WEAK and not is_sure):
             return None

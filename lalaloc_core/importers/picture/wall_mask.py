@@ -17,8 +17,6 @@ from lalaloc_core.importers.common.geometry import cross, polygons_from_geometry
 from lalaloc_core.importers.picture.ink import Ink
 
 _MIN_THICKNESS_M = 0.055
-# Share of the walls, by area, that is thinner than thin ones.
-_THIN_WALLS = 0.08
 # Broadest strokes and leaves between two lines relative to walls, with the thinnest inner wall (m) beside them.
 _STROKE, _LEAF = (0.4, 0.075), (0.55, 0.1)
 # Largest white gap between the two lines of a wall; the sector of a door swing is wider.
@@ -31,9 +29,9 @@ _OUTLINED_RANGE, _FILLED_RANGE, _DISC_OF_WALL, _DISC = (0.6, 2.5), (0.6, 3.0), 1
 _WIDE_PART = 0.15
 # White areas in walls: least length of sure ones (m), share of the walls that sets the thickest, tolerance of widths,
 # least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, wide part of a
-# strip, and share of its middle where its width is even.
+# strip, tolerance of its width, and largest share of its middle beyond that.
 _LONG_M, _WIDEST_WALLS, _LIKE_USUAL, _OBLONG, _PIER = 1.5, 0.9, 0.25, 2.5, 1.5
-_PANE, _THINNEST_PANE, _WIDE_IN_STRIP, _EVEN, _EVENLY = 0.15, 0.28, 0.03, 0.35, 0.7
+_PANE, _THINNEST_PANE, _WIDE_IN_STRIP, _EVEN, _UNEVEN = 0.15, 0.28, 0.03, 0.35, 0.3
 # Width of lines, and reach across them (pixels).
 _PEN_PX, _LINES_PX = 2.0, 11
 # Thickest strip of a wall with its lines (m), and share of a white area in such strips. Shortest stroke of a hatch (m),
@@ -53,14 +51,10 @@ _ALONG_AXIS_DEG, _ALONG_AXIS_M = 6.0, 0.06
 
 @dataclass(frozen=True, eq=False)
 class WallMask:
-    """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls.
-
-    `thickness_m` is usual, and `thin_m` that of thin walls: inner ones can be a third as thick as outer ones.
-    """
+    """Wall pixels; `cavities` labels the white areas inside walls, 0 elsewhere, and is None for dark walls."""
 
     mask: Bool[np.ndarray, "h w"]
     thickness_m: float
-    thin_m: float
     cavities: Int[np.ndarray, "h w"] | None
 
 
@@ -154,9 +148,9 @@ def _is_in_wall(
     is_strip &= (length >= _OBLONG * inner) & (wide <= _WIDE_IN_STRIP * area)
     # A strip has its width along all of its middle; the paper between fixtures and letters only has it on average.
     is_middle = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
-    is_even = is_middle & (np.abs(2.0 * depth - width[labels]) <= _EVEN * width[labels])
-    middle, even = (np.bincount(labels[where], minlength=count) for where in (is_middle, is_even))
-    is_strip &= even >= _EVENLY * middle
+    is_off = is_middle & (np.abs(2.0 * depth - width[labels]) > _EVEN * width[labels])
+    middle, off = (np.bincount(labels[where], minlength=count) for where in (is_middle, is_off))
+    is_strip &= off <= _UNEVEN * middle
     is_like_wall = is_thin(min(_PIER * widest, _THICKEST_M / pixel)) & (width >= _THINNEST_PANE * inner)
     # Corners of a hatch are cut into small parts.
     is_corner = is_beside & (area <= np.median(area[is_hatched])) if is_hatched.any() else is_hatched
@@ -208,8 +202,7 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
         _, found, stats, _ = cv2.connectedComponentsWithStats(filled, connectivity=8)
         # Longer areas are panes of windows.
         kept |= (stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) <= 2 * len(notch))[np.asarray(found)]
-    thin_m = usual_thickness(kept.astype(np.uint8), _THIN_WALLS) * ink.metres_per_pixel
-    return WallMask(kept, thickness, thin_m, cavities) if kept.any() else None
+    return WallMask(kept, thickness, cavities) if kept.any() else None
 
 
 def _min_thickness_px(ink: Ink) -> int:

@@ -47,8 +47,8 @@ class GapContent:
     """Content of a gap.
 
     Attributes:
-        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single line,
-            "leaf" for leaves without an arc that stand open, which alone show no opening.
+        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single
+            line, "leaf" for leaves without an arc, which show no opening alone.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
         lines: number of lines along the wall.
         leaf_m: width of the leaf that swings, 0 without one.
@@ -82,7 +82,7 @@ class GapReader:
     def classify(self, gap: Gap) -> GapContent:
         """Return the most likely content of a gap."""
         swing, leaves, alone = 0.0, 1, 0
-        if is_door := _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
+        if _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
             swing, leaves, alone = self._swing(gap, self._near)
             if swing < _ARC:
                 swing, leaves, _ = self._swing(gap, self._near_hairlines, is_pale=True)
@@ -104,8 +104,8 @@ class GapReader:
             return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
             return GapContent("line", share, warmth, lines)
-        if alone or (is_door and self._is_folded(gap)):
-            return GapContent("leaf", _ARC, leaf_m=gap.width / alone if alone else 0.0)
+        if alone:
+            return GapContent("leaf", _ARC, leaf_m=gap.width / alone)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
     def _swing(self, gap: Gap, near: Bool[np.ndarray, "h w"], *, is_pale: bool = False) -> tuple[float, int, int]:
@@ -123,8 +123,10 @@ class GapReader:
         )  # fmt: skip
         x = hinge + (1.0 - 2.0 * hinge) * distance / count * np.cos(angle)
         y = offset + side * distance / count * np.sin(angle)
-        is_outside = np.abs(y) > half
-        is_inked = self._inked(gap, near, x, y) & is_outside
+        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
+        columns, rows = (start[k] + 1.0 + x * (end - start)[k] + (2 * k - 1) * y * (end - start)[1 - k] for k in (0, 1))
+        inside = (rows.clip(0, near.shape[0] - 1).astype(np.intp), columns.clip(0, near.shape[1] - 1).astype(np.intp))
+        is_inked = near[inside] & (np.abs(y) > half)
         # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
         arcs = is_inked[..., :36, 19:23]
         leaves = is_inked[..., :21].mean(axis=-1)
@@ -148,37 +150,6 @@ class GapReader:
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
         without_arc = 1 if alone[0].any() else 2 * int(alone[1].all(axis=-1).any())
         return (two, 2, without_arc) if two > one else (one, 1, without_arc)
-
-    def _inked(self, gap: Gap, near: Bool[np.ndarray, "h w"], x: np.ndarray, y: np.ndarray) -> Bool[np.ndarray, "..."]:
-        """Return whether there is ink at places along and across a gap, relative to its width."""
-        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
-        along = end - start
-        columns = (start[0] + 1.0 + x * along[0] - y * along[1]).astype(np.intp)
-        rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
-        return near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
-
-    def _is_folded(self, gap: Gap) -> bool:
-        """Return whether the two leaves of a folding door stand before a jamb as two sides of a triangle."""
-        half, along = 0.5 * gap.shape.area / gap.width**2, np.linspace(0.04, 0.96, 24)
-        finest = 8.0 * self._ink.metres_per_pixel / self._finer / gap.width
-        feet, heights = np.linspace(max(0.12, finest), 1.0, 23), np.linspace(max(0.08, finest), 0.6, 14)
-        # The lines of the triangles, and those inside and around them, which are free.
-        side, hinge, offset, foot, height, relative, share = np.meshgrid(
-            [1.0, -1.0],
-            [0.0, 1.0],
-            [half, 0.0, -half],
-            feet,
-            heights,
-            [1.0, 0.5, 1.5],
-            along,
-            indexing="ij",
-            sparse=True,
-        )
-        y = offset + side * height * relative * (1.0 - np.abs(2.0 * share - 1.0))
-        is_inked = self._inked(gap, self._near, hinge + (1.0 - 2.0 * hinge) * foot * share, y)
-        leaves, others = is_inked[..., 0, :].reshape(*is_inked.shape[:-2], 2, 12), is_inked[..., 1:, 8:16]
-        is_drawn = leaves.mean(axis=-1).min(axis=-1) >= _LEAF_ALONE
-        return bool((is_drawn & (others.mean(axis=-1).max(axis=-1) <= 0.1)).any())
 
     def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float, int]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
@@ -269,8 +240,7 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: Callable[[], None]) 
 
 def _side_by_side(first: Shape, second: Shape, line_m: float) -> bool:
     """Return whether two strips lie along each other, at most a line apart."""
-    if shapely.distance(first.outline, second.outline) > line_m or abs(float(first.axis @ second.axis)) < _PARALLEL:
-        return False
-    shared = first.outline.buffer(line_m, cap_style="square", join_style="mitre").intersection(second.outline)
     shorter, longer = sorted((first.long_m, second.long_m))
-    return shorter > 0.8 * longer and shared.length > shorter
+    apart = abs(float((first.centre - second.centre) @ first.axis))
+    is_alike = shorter > 0.8 * longer and apart < 0.2 * longer and abs(float(first.axis @ second.axis)) >= _PARALLEL
+    return is_alike and bool(shapely.distance(first.outline, second.outline) <= line_m)
