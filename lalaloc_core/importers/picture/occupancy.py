@@ -161,8 +161,9 @@ def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h
 def _is_floor(mask: Bool[np.ndarray, "h w"], cell_m: float) -> bool:
     """Return whether an area is wide nearly everywhere, apart from lines over it; walls are so at corners alone."""
     inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
-    is_wide = _near(inside, 2.0 * _INSIDE_M / cell_m)
-    return bool(inside.any()) and min(mask[inside].mean(), is_wide[mask].mean()) >= _EVEN
+    return (
+        bool(inside.any()) and min(mask[inside].mean(), _near(inside, 2.0 * _INSIDE_M / cell_m)[mask].mean()) >= _EVEN
+    )
 
 
 def _lines_around(
@@ -304,10 +305,9 @@ def _read_walls(cells: UInt8[np.ndarray, "h w"], grid: OccupancyGrid, budget: Bu
             floor = shapely.transform(part, to_grid)
             if _free_share(floor, grid) >= _FREE_SHARE:
                 rooms.append(SketchedRoom(shapely.transform(floor, frame.to_map)))
-    openings = []
-    for opening in sketch.openings:
-        start, end = to_map(np.array([opening.start, opening.end]))
-        openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
+    ends = [to_map(np.array([opening.start, opening.end])) for opening in sketch.openings]
+    placed = zip(sketch.openings, ends, strict=True)
+    openings = [SketchedOpening(old.kind, point_xy(start), point_xy(end)) for old, (start, end) in placed]
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
 
 
@@ -336,14 +336,10 @@ def _furniture(
 
 def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Bool[np.ndarray, "h w"]) -> list[float]:
     """Return the share of each room's outline (map frame) that has a wall beside it that was seen."""
-    cell_m, shares = grid.frame.resolution_m, []
-    distance_m = np.asarray(cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)) * cell_m
-    for outline in (room.shape.exterior for room in rooms):
-        count = max(8, math.ceil(outline.length / cell_m))
-        points = outline.interpolate(np.linspace(0.0, 1.0, count), normalized=True)
-        row, column = grid.frame.cells_at(shapely.get_coordinates(points))
-        shares.append(float((distance_m[row, column] <= _BESIDE_CELLS * cell_m).mean()))
-    return shares
+    near, lines = _near(seen, _BESIDE_CELLS), [room.shape.exterior for room in rooms]
+    steps = [np.linspace(0.0, 1.0, max(8, math.ceil(line.length / grid.frame.resolution_m))) for line in lines]
+    points = [line.interpolate(step, normalized=True) for line, step in zip(lines, steps, strict=True)]
+    return [float(near[grid.frame.cells_at(shapely.get_coordinates(each))].mean()) for each in points]
 
 
 def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuilder) -> None:
@@ -368,11 +364,7 @@ def _without_specks(cells: Bool[np.ndarray, "h w"], frame: MapFrame) -> UInt8[np
 
 def _free_share(room: shapely.Polygon, grid: OccupancyGrid) -> float:
     """Return the share of free cells in a room, whose coordinates are metres along the grid."""
-    cells = [
-        np.array([0, grid.frame.size[0]]) + np.array(ring.coords) * [1, -1] / grid.frame.resolution_m
-        for ring in (room.exterior, *room.interiors)
-    ]
-    inside = cv2.fillPoly(
-        np.zeros(grid.frame.size, np.uint8), [np.round(ring - 0.5).astype(np.int32) for ring in cells], 1
-    )
+    flip, inside = np.array([1.0, -1.0]) / grid.frame.resolution_m, np.zeros(grid.frame.size, np.uint8)
+    rings = [shapely.get_coordinates(ring) * flip for ring in (room.exterior, *room.interiors)]
+    cv2.fillPoly(inside, [np.round(np.add(ring, [-0.5, len(inside) - 0.5])).astype(np.int32) for ring in rings], 1)
     return float(grid.free[inside > 0].mean()) if inside.any() else 0.0

@@ -185,7 +185,6 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     budget.begin(f"finding rooms between {'dark walls' if is_dark else 'outlined walls'}")
     reader = GapReader(ink, walls)
     contents: dict[int, GapContent] = {}
-    # Inner walls can be a third as thick as outer ones.
     thin_m = usual_thickness(walls.mask.astype(np.uint8), _THIN) * ink.metres_per_pixel
 
     def rank(gap: Gap) -> int | None:
@@ -304,8 +303,8 @@ def _openings(
         is_clear = len(panes) == 1 or (len(panes) > 1 and widths[panes[-2]] <= _NARROWER * widths[panes[-1]])
         if is_clear and all(found[k].kind == "window" for k in wide):
             gate = found[panes[-1]] = replace(found[panes[-1]], kind="door")
-            position = f"({gate.start[0]:.2f}, {gate.start[1]:.2f})"
-            builder.unsure.append(f"a window at {position} is taken for a door, as no other leads there")
+            x, y = gate.start
+            builder.unsure.append(f"a window at ({x:.2f}, {y:.2f}) is taken for a door, as no other leads there")
     return found
 
 

@@ -24,8 +24,7 @@ from lalaloc_core.importers.picture.wall_mask import WallMask
 
 # Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (m), at least a pixel.
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
-_NEAR_M, _COARSE_M = 0.017, 0.02
-_DOOR_M = (0.5, 2.4)
+_NEAR_M, _COARSE_M, _DOOR_M = 0.017, 0.02, (0.5, 2.4)
 # Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
 _LEAF_ALONE, _BESIDE = 0.95, 0.45
 # Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
@@ -35,11 +34,9 @@ _BOW_M, _BOW = (0.8, 4.0), (0.08, 0.5)
 # Contrast of 255: of a line's pixels, of the mean of a line at an edge of its gap, and between a line and the paper
 # beside it; the part of a line's contrast that its pixels have; and of arcs as thin as a hair.
 _FAINT, _DIP, _RISE, _OF_DEPTH, _HAIRLINE = 22.0, 30.0, 12.0, 0.25, 12.0
-# A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular.
-_MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
-_FULL, _LONG = 0.8, 3.0
-# Smallest cosine of two parallel strips, and number of panes of a window: hatches have more strips.
-_PARALLEL, _PANES = 0.99, (2, 5)
+# A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular. Panes
+# of a window are parallel (cosine), and few: hatches have more strips.
+_MIN_LENGTH_M, _OF_WALL, _FULL, _LONG, _PARALLEL, _PANES = 0.4, (0.12, 0.72), 0.8, 3.0, 0.99, (2, 5)
 
 
 @dataclass(frozen=True)
@@ -142,8 +139,7 @@ class GapReader:
         is_free = np.maximum(beside, is_inked[..., 6:40, 25:].mean(axis=-1)) <= _BESIDE
         up_to = (np.cumsum(arcs, axis=-2) / np.arange(1, 37)[:, None])[..., 3:30, :].max(axis=-1)
         leaf = leaves[..., 6:33]
-        is_slanted = is_free[..., :27] & (up_to >= _ARC) & (leaf >= _LEAF)
-        slanted = np.where(is_slanted, 0.5 * (leaf + up_to), 0.0)
+        slanted = np.where(is_free[..., :27] & (up_to >= _ARC) & (leaf >= _LEAF), 0.5 * (leaf + up_to), 0.0)
         best = np.maximum(shares.max(axis=(-2, -1)), slanted.max(axis=(-2, -1)))
         alone = (is_free & (at_tip <= _BESIDE) & (leaves[..., 6:40] >= _LEAF_ALONE)).any(axis=(-2, -1))
         # Both of two leaves must be visible.
