@@ -181,12 +181,12 @@ def two_rooms() -> tuple[Image.Image, ImageDraw.ImageDraw]:
     return page, pen
 
 
-@pytest.mark.parametrize("symbol", ["leaf and arc", "leaf", "pale arc"])
+@pytest.mark.parametrize("symbol", ["leaf and arc", "leaf", "pale arc", "upright leaf"])
 def test_door_with_a_half_open_leaf_or_a_pale_arc_is_a_door(symbol: str):
     page, pen = two_rooms()
     pen.rectangle((440, 200, 460, 290), fill="white")
     if "leaf" in symbol:
-        pen.line((450, 200, 514, 264), fill="black", width=4)
+        pen.line((450, 200, *((540, 200) if symbol == "upright leaf" else (514, 264))), fill="black", width=4)
     if "arc" in symbol:
         pen.arc((360, 110, 540, 290), 0 if symbol == "pale arc" else 45, 90, fill=(225, 225, 225))
     (door,) = lines(import_plan(picture_file(page), ImportOptions(metres_per_pixel=0.01)).document, "door")

@@ -159,9 +159,11 @@ def _distances(colours: np.ndarray, tones: np.ndarray) -> Float[np.ndarray, "n h
 
 
 def _is_floor(mask: Mask, cell_m: float) -> bool:
-    """Return whether an area is wide somewhere, apart from lines over it."""
+    """Return whether an area is wide nearly everywhere, apart from lines over it; walls are so at corners alone."""
     inside = ~_near(~_closed(mask, _NOTCH_M / cell_m), _INSIDE_M / cell_m)
-    return bool(inside.any()) and float(mask[inside].mean()) >= _EVEN
+    return (
+        bool(inside.any()) and min(mask[inside].mean(), _near(inside, 2.0 * _INSIDE_M / cell_m)[mask].mean()) >= _EVEN
+    )
 
 
 def _lines_at(ground: Mask, floor: Mask, colours: np.ndarray, tones: Float[np.ndarray, "n 3"], cell_m: float) -> Mask:
@@ -293,10 +295,9 @@ def _read_walls(cells: Gray, grid: OccupancyGrid, budget: Budget) -> tuple[Sketc
             floor = shapely.transform(part, to_grid)
             if _free_share(floor, grid) >= _FREE_SHARE:
                 rooms.append(SketchedRoom(shapely.transform(floor, frame.to_map)))
-    openings = []
-    for opening in sketch.openings:
-        start, end = to_map(np.array([opening.start, opening.end]))
-        openings.append(SketchedOpening(opening.kind, point_xy(start), point_xy(end)))
+    ends = [to_map(np.array([opening.start, opening.end])) for opening in sketch.openings]
+    placed = zip(sketch.openings, ends, strict=True)
+    openings = [SketchedOpening(old.kind, point_xy(start), point_xy(end)) for old, (start, end) in placed]
     return Sketch(rooms=rooms, openings=openings, recall=_RECALL, kinds=("door", "passage")), inner
 
 
@@ -323,14 +324,10 @@ def _furniture(cells: Gray, frame: MapFrame) -> tuple[Gray, list[tuple[float, fl
 
 def _seen_shares(rooms: Sequence[SketchedRoom], grid: OccupancyGrid, seen: Mask) -> list[float]:
     """Return the share of each room's outline (map frame) that has a wall beside it that was seen."""
-    cell_m, shares = grid.frame.resolution_m, []
-    distance_m = np.asarray(cv2.distanceTransform((~seen).astype(np.uint8), cv2.DIST_L2, 5)) * cell_m
-    for outline in (room.shape.exterior for room in rooms):
-        count = max(8, math.ceil(outline.length / cell_m))
-        points = outline.interpolate(np.linspace(0.0, 1.0, count), normalized=True)
-        row, column = grid.frame.cells_at(shapely.get_coordinates(points))
-        shares.append(float((distance_m[row, column] <= _BESIDE_CELLS * cell_m).mean()))
-    return shares
+    near, lines = _near(seen, _BESIDE_CELLS), [room.shape.exterior for room in rooms]
+    steps = [np.linspace(0.0, 1.0, max(8, math.ceil(line.length / grid.frame.resolution_m))) for line in lines]
+    points = [line.interpolate(step, normalized=True) for line, step in zip(lines, steps, strict=True)]
+    return [float(near[grid.frame.cells_at(shapely.get_coordinates(each))].mean()) for each in points]
 
 
 def _report_free_cells(sketch: Sketch, grid: OccupancyGrid, builder: ReportBuilder) -> None:
@@ -355,12 +352,7 @@ def _without_specks(cells: Mask, frame: MapFrame) -> Gray:
 
 def _free_share(room: shapely.Polygon, grid: OccupancyGrid) -> float:
     """Return the share of free cells in a room, whose coordinates are metres along the grid."""
-    rows, _ = grid.frame.size
-    x0, y0, x1, y1 = (int(value / grid.frame.resolution_m) for value in room.bounds)
-    y, x = np.mgrid[max(y0, 0) : y1 + 1, max(x0, 0) : x1 + 1]
-    shapely.prepare(room)
-    size = grid.frame.resolution_m
-    inside = shapely.contains_xy(room, (x + 0.5) * size, (y + 0.5) * size)
-    row = np.clip(rows - 1 - y[inside], 0, rows - 1)
-    column = np.clip(x[inside], 0, grid.frame.size[1] - 1)
-    return float(grid.free[row, column].mean()) if inside.any() else 0.0
+    flip, inside = np.array([1.0, -1.0]) / grid.frame.resolution_m, np.zeros(grid.frame.size, np.uint8)
+    rings = [shapely.get_coordinates(ring) * flip for ring in (room.exterior, *room.interiors)]
+    cv2.fillPoly(inside, [np.round(np.add(ring, [-0.5, len(inside) - 0.5])).astype(np.int32) for ring in rings], 1)
+    return float(grid.free[inside > 0].mean()) if inside.any() else 0.0

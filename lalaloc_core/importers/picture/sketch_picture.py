@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.opening_trust import reached_rooms
 from lalaloc_core.importers.common import Budget, ReportBuilder
 from lalaloc_core.importers.common.geometry import polygons_of
 from lalaloc_core.importers.common.room_bounds import WallConfig
@@ -22,18 +23,24 @@ from lalaloc_core.importers.drawing.vector_drawing import Lettering
 from lalaloc_core.importers.picture.ink import FINEST_M, Gray, Ink, read_ink
 from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.symbols import Symbol, find_symbols, fixtures_in, is_taken, without_symbols
-from lalaloc_core.importers.picture.wall_mask import WallMask, align_edges, dark_walls, outlined_walls, wall_polygons
+from lalaloc_core.importers.picture.wall_mask import (
+    WallMask,
+    align_edges,
+    dark_walls,
+    outlined_walls,
+    usual_thickness,
+    wall_polygons,
+)
 from lalaloc_core.importers.picture.wall_symbols import GapContent, GapReader, windows_in_walls
 
 # Windows are gaps in dark walls and wider than doors. A wide gap without a symbol is not an opening.
 _CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04, blunt=0.05, shallowest_room=0.4, widest_pier=1.2)
 _WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
-# Thickness of the ends of walls beside an empty gap, relative to the usual wall; other ends are of furniture.
-_LIKE_WALL = (0.4, 1.8)
-# Smallest such thickness beside a symbol that is drawn in part, and the share of that.
-_AS_WALL, _WEAK = 0.6, 0.8
-_MIN_ROOM_M2 = 0.8
+# Thickness of the ends of walls beside a gap: least share of thin walls, and largest share of the usual beside an empty
+# one; other ends are of furniture. Share of the walls that thin ones have, and of a symbol that is drawn in part.
+_LIKE_WALL, _THIN, _WEAK = (0.6, 1.5), 0.08, 0.8
+_MIN_ROOM_M2 = 0.5
 _MAX_ISLAND_M2 = 2.0
 # Smallest area (m²) and largest length (m) of a terrace, and its distance (m) from the rooms and from its name.
 _TERRACE, _AT_TERRACE_M = (1.5, 20.0), 1.0
@@ -50,8 +57,9 @@ _RECALL = 0.95
 _CLOSING_M, _CLEARANCE_M, _COVERED, _MAX_NAMED = 1.5, 0.2, 0.9, 5
 _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M, _THICK_M = 1.2, 0.6
-# Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it.
-_WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Wider openings in inner walls are glass. Rooms beside a wall are searched at this distance from it. Least width of the
+# gate of a garage, and width of windows relative to a clearly wider one.
+_WIDEST_DOOR_M, _BESIDE_M, _GATE_M, _NARROWER = 1.3, 0.25, 2.0, 0.8
 # Least number of doors that are drawn without a swing, least share of other openings that have more lines, and share of
 # a line that is drawn: dashes in an inner wall are a beam.
 _DOORS_ALIKE, _UNLIKE, _DASHED = 3, 0.5, 0.7
@@ -80,13 +88,11 @@ class _Reading:
         """Return whether this reading has all rooms of another one and more."""
         if self.area_m2 < smaller.area_m2 + _MIN_ROOM_M2 or not smaller.enclosed.rooms:
             return False
-        tree = shapely.STRtree(self.enclosed.rooms)
-        for room in smaller.enclosed.rooms:
-            near = tree.geometries[tree.query(room, predicate="intersects")]
-            shared = shapely.area(shapely.intersection(near, room))
-            if not (shared >= _SAME_ROOM * (shapely.area(near) + room.area - shared)).any():
-                return False
-        return True
+        known, found = np.array(smaller.enclosed.rooms), np.array(self.enclosed.rooms)
+        a, b = shapely.STRtree(found).query(known, predicate="intersects")
+        shared = shapely.area(shapely.intersection(known[a], found[b]))
+        is_same = shared >= _SAME_ROOM * (shapely.area(known[a]) + shapely.area(found[b]) - shared)
+        return len(np.unique(a[is_same])) == len(known)
 
     def divided(self, letterings: Sequence[Lettering], budget: Budget) -> _Reading:
         """Return the reading with rooms that have several names divided at passages wider than a door."""
@@ -152,11 +158,13 @@ def sketch_picture(
         budget.trace.add("no room", builder.no_room)
     budget.begin("finding doors and windows")
     rooms = [SketchedRoom(align_edges(_without_islands(room, builder))) for room in best.enclosed.rooms]
-    rooms += [SketchedRoom(align_edges(area)) for area in _terraces(best, ink, letterings)]
+    terraces = _terraces(best, ink, letterings)
+    rooms += [SketchedRoom(align_edges(area)) for area in terraces]
     outside = shapely.unary_union([room.buffer(0.05) for room in best.enclosed.rooms])
     # A gap away from all rooms lies between other strokes.
     gaps = [gap for gap in best.enclosed.gaps if outside.intersects(gap.shape)]
-    openings = _openings(best, gaps, ink, builder, budget)
+    garages = [shapely.Point(text.position) for text in letterings if "garage" in text.room_types]
+    openings = _openings(best, gaps, terraces, garages, ink, builder, budget)
     fixtures = _fixtures(symbols, shapes, best, builder) if has_symbols else []
     # Faces of walls are the middles of their lines.
     pen_m = 0.0 if best.is_dark else _PEN_PX * ink.metres_per_pixel
@@ -176,24 +184,23 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     budget.begin(f"finding rooms between {'dark walls' if is_dark else 'outlined walls'}")
     reader = GapReader(ink, walls)
     contents: dict[int, GapContent] = {}
+    thin_m = usual_thickness(walls.mask.astype(np.uint8), _THIN) * ink.metres_per_pixel
 
     def rank(gap: Gap) -> int | None:
         contents[id(gap)] = found = reader.classify(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
-        is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
+        is_bare = found.kind in ("leaf", "nothing") or (found.kind == "line" and not gap.is_between_ends)
         depth_m = gap.shape.area / gap.width
-        relative = depth_m / walls.thickness_m
-        if is_bare and not (gap.is_sure and gap.width <= widest and _LIKE_WALL[0] <= relative <= _LIKE_WALL[1]):
-            return None
-        is_weak = found.kind != "nothing" and found.confidence <= _WEAK
-        if is_weak and not (gap.is_sure and relative >= _AS_WALL):
+        is_sure = gap.is_sure and depth_m >= _LIKE_WALL[0] * thin_m
+        is_passage = is_sure and gap.width <= widest and depth_m <= _LIKE_WALL[1] * walls.thickness_m
+        if (is_bare and not is_passage) or (found.confidence <= _WEAK and not is_sure):
             return None
         if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None
         # Gaps overlap both walls by 2 cm, so that narrow ones seem deeper by up to a tenth.
         if depth_m > 1.1 * _CONFIG.thickest and (found.kind != "pane" or gap.width <= _MAX_BARE_GAP_M):
             return None
-        return ("swing", "pane", "line", "nothing").index(found.kind)
+        return ("swing", "pane", "line", "leaf", "nothing").index(found.kind)
 
     enclosed = enclose(wall_polygons(walls, ink, budget.check_time), [], (), _CONFIG, budget.check_time, rank)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
@@ -251,9 +258,15 @@ def _fixtures(
 
 
 def _openings(
-    reading: _Reading, gaps: Sequence[Gap], ink: Ink, builder: ReportBuilder, budget: Budget
+    reading: _Reading,
+    gaps: Sequence[Gap],
+    terraces: Sequence[shapely.Polygon],
+    garages: Sequence[shapely.Point],
+    ink: Ink,
+    builder: ReportBuilder,
+    budget: Budget,
 ) -> list[SketchedOpening]:
-    """Return the openings: gaps by their content and the rooms beside them, and windows drawn into walls."""
+    """Return the openings: gaps by their content and the areas beside them, and windows drawn into walls."""
     candidates = [(gap.start, gap.end, reading.contents[id(gap)]) for gap in gaps]
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink, budget.check_time)
@@ -263,15 +276,34 @@ def _openings(
         (content, math.dist(start, end), is_between_rooms(start, end, reach_m, rooms))
         for start, end, content in candidates
     ]
-    found, lines_of_doors = [], _lines_of_doors(placed)
+    # Leaves that open onto a terrace are cut out of it.
+    around = [terrace.convex_hull.difference(shapely.union_all(rooms.geometries)) for terrace in terraces]
+    areas = [*reading.enclosed.rooms, *around]
+    found, beside, lines_of_doors = list[SketchedOpening](), list[list[int]](), _lines_of_doors(placed)
     for (start, end, _), (content, width, is_inner) in zip(candidates, placed, strict=True):
         budget.check_time()
         kind = _kind(content, width, lines_of_doors, is_inner=is_inner)
+        own = reached_rooms(areas, [shapely.LineString([start, end])])
+        if is_inner and len(own) < 2 and content.kind in ("leaf", "nothing"):
+            continue  # Between a wall and furniture.
         found.append(SketchedOpening(kind, start, end))
+        beside.append(own)
         if (doubt := _doubt(content, kind)) is not None:
             position = f"({start[0]:.2f}, {start[1]:.2f})"
             builder.unsure.append(f"a gap of {width:.2f} m at {position} is taken for a {kind}: {doubt}")
             builder.places[builder.unsure[-1]] = shapely.Point(start)
+    widths = [opening.line.length for opening in found]
+    for number, area in enumerate(areas):
+        # Sliding doors of closets and terraces, and gates of garages, are drawn like windows.
+        least_m = _GATE_M if any(map(area.covers, garages)) else 0.0
+        wide = [k for k, own in enumerate(beside) if number in own and widths[k] >= least_m]
+        panes = sorted((k for k in wide if least_m or len(beside[k]) > 1), key=lambda k: widths[k])
+        is_clear = len(panes) == 1 or (len(panes) > 1 and widths[panes[-2]] <= _NARROWER * widths[panes[-1]])
+        if is_clear and all(found[k].kind == "window" for k in wide):
+            gate = found[panes[-1]] = replace(found[panes[-1]], kind="door")
+            x, y = gate.start
+            builder.unsure.append(f"a window at ({x:.2f}, {y:.2f}) is taken for a door, as no other leads there")
+            builder.places[builder.unsure[-1]] = shapely.Point(x, y)
     return found
 
 
@@ -287,7 +319,7 @@ def _lines_of_doors(placed: Sequence[tuple[GapContent, float, bool]]) -> float:
 
 def _kind(content: GapContent, width: float, lines_of_doors: float, *, is_inner: bool) -> OpeningKind:
     """Classify an opening. Lines in an inner wall are a door without a swing, in an outer wall a window."""
-    if content.kind == "swing":
+    if content.kind in ("swing", "leaf"):
         return "door"
     if content.kind == "nothing":
         return "passage"

@@ -123,13 +123,10 @@ def _is_stove(shape: Shape, parts: Sequence[Shape]) -> bool:
     burners = _outermost(circles)
     if not _fits(shape, _HOB_M) or len(burners) != 4:
         return False
-    # Centres of a grid of two by two, along the sides of the box.
+    # Centres in the four quarters of the box, as far from its middle.
     places = (np.array([burner.centre for burner in burners]) - shape.centre) @ shape.frame
-    rows = np.sort(places, axis=0)
-    spans = rows[2:].mean(axis=0) - rows[:2].mean(axis=0)
-    off = np.abs(np.abs(places - places.mean(axis=0)) - 0.5 * spans).max()
-    is_centred = np.abs(places.mean(axis=0)).max() <= 0.25 * shape.long_m
-    return bool(is_centred and np.all((spans >= _BURNERS_M[0]) & (spans <= _BURNERS_M[1])) and off <= 0.06)
+    is_apart = np.all((np.abs(places) >= 0.5 * _BURNERS_M[0]) & (np.abs(places) <= 0.5 * _BURNERS_M[1]))
+    return bool(is_apart) and len({(x > 0.0, y > 0.0) for x, y in places}) == 4
 
 
 def _toilets(shapes: Sequence[Shape]) -> list[Symbol]:

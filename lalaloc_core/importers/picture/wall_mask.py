@@ -28,10 +28,10 @@ _OUTLINED_RANGE, _FILLED_RANGE, _DISC_OF_WALL, _DISC = (0.6, 2.5), (0.6, 3.0), 1
 # Largest share of a cavity that can be wider than a wall, at the junctions of walls.
 _WIDE_PART = 0.15
 # White areas in walls: least length of sure ones (m), share of the walls that sets the thickest, tolerance of widths,
-# least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, and wide part
-# of a strip.
+# least length of strips and thickness of piers relative to the usual, widths of panes around 0.4 of it, wide part of a
+# strip, tolerance of its width, and largest share of its middle beyond that.
 _LONG_M, _WIDEST_WALLS, _LIKE_USUAL, _OBLONG, _PIER = 1.5, 0.9, 0.25, 2.5, 1.5
-_PANE, _THINNEST_PANE, _WIDE_IN_STRIP = 0.15, 0.28, 0.03
+_PANE, _THINNEST_PANE, _WIDE_IN_STRIP, _EVEN, _UNEVEN = 0.15, 0.28, 0.03, 0.35, 0.3
 # Width of lines, and reach across them (pixels).
 _PEN_PX, _LINES_PX = 2.0, 11
 # Thickest strip of a wall with its lines (m), and share of a white area in such strips. Shortest stroke of a hatch (m),
@@ -144,6 +144,11 @@ def _is_in_wall(
     is_strip = (np.abs(width / inner - 1.0) <= _LIKE_USUAL) | (np.abs(width / inner - 0.4) <= _PANE)
     wide = np.bincount(labels[depth > 0.5 * (1.0 + _LIKE_USUAL) * inner + 1.0], minlength=count)
     is_strip &= (length >= _OBLONG * inner) & (wide <= _WIDE_IN_STRIP * area)
+    # A strip has its width along all of its middle; the paper between fixtures and letters only has it on average.
+    is_middle = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
+    is_off = is_middle & (np.abs(2.0 * depth - width[labels]) > _EVEN * width[labels])
+    middle, off = (np.bincount(labels[where], minlength=count) for where in (is_middle, is_off))
+    is_strip &= off <= _UNEVEN * middle
     is_like_wall = is_thin(min(_PIER * widest, _THICKEST_M / pixel)) & (width >= _THINNEST_PANE * inner)
     # Corners of a hatch are cut into small parts.
     is_corner = is_beside & (area <= np.median(area[is_hatched])) if is_hatched.any() else is_hatched

@@ -6,7 +6,7 @@ These are lines along the middle, closed at both ends.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -14,17 +14,17 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.common.geometry import opening_line, side_lengths
+from lalaloc_core.importers.common.geometry import opening_line
 from lalaloc_core.importers.common.import_limits import CheckTime
 from lalaloc_core.importers.common.sketch import SketchedOpening
 from lalaloc_core.importers.drawing.enclosed_rooms import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink, Mask, faint_lines
+from lalaloc_core.importers.picture.symbol_shapes import Shape, closed_shapes
 from lalaloc_core.importers.picture.wall_mask import WallMask
 
 # Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (m), at least a pixel.
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
-_NEAR_M, _COARSE_M = 0.017, 0.02
-_DOOR_M = (0.5, 2.4)
+_NEAR_M, _COARSE_M, _DOOR_M = 0.017, 0.02, (0.5, 2.4)
 # Leaves that are no full arc's: smallest share of one without an arc, and largest inked share beside a symbol.
 _LEAF_ALONE, _BESIDE = 0.95, 0.45
 # Lines of panes that a scan broke: smallest inked shares, of the whole line and of each quarter.
@@ -34,10 +34,9 @@ _BOW_M, _BOW = (0.8, 4.0), (0.08, 0.5)
 # Contrast of 255: of a line's pixels, of the mean of a line at an edge of its gap, and between a line and the paper
 # beside it; the part of a line's contrast that its pixels have; and of arcs as thin as a hair.
 _FAINT, _DIP, _RISE, _OF_DEPTH, _HAIRLINE = 22.0, 30.0, 12.0, 0.25, 12.0
-# A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular.
-_MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
-_FULL, _LONG = 0.8, 3.0
-_SLANTED_DEG = 8.0
+# A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular. Panes
+# of a window are parallel (cosine), and few: hatches have more strips.
+_MIN_LENGTH_M, _OF_WALL, _FULL, _LONG, _PARALLEL, _PANES = 0.4, (0.12, 0.72), 0.8, 3.0, 0.99, (2, 5)
 
 
 @dataclass(frozen=True)
@@ -45,13 +44,14 @@ class GapContent:
     """Content of a gap.
 
     Attributes:
-        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single line.
+        kind: "swing" for the leaf of a door, "pane" for two or more lines along the wall, "line" for a single
+            line, "leaf" for leaves without an arc, which show no opening alone.
         warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
         lines: number of lines along the wall.
         leaf_m: width of the leaf that swings, 0 without one.
     """
 
-    kind: Literal["swing", "pane", "line", "nothing"]
+    kind: Literal["swing", "pane", "line", "leaf", "nothing"]
     confidence: float
     warmth: float = 0.0
     lines: int = 0
@@ -64,7 +64,7 @@ class GapReader:
     def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
         # Arcs of few pixels are compared on a finer picture: their lines would cover what is drawn beside them.
-        self._finer = max(1, round(ink.metres_per_pixel / _COARSE_M))
+        self._finer = math.ceil(ink.metres_per_pixel / _COARSE_M)
         gray, inked, wall = (
             cv2.resize(part.astype(np.uint8), None, fx=self._finer, fy=self._finer, interpolation=cv2.INTER_CUBIC)
             for part in (ink.gray, ink.lines, walls.mask)
@@ -78,11 +78,11 @@ class GapReader:
 
     def classify(self, gap: Gap) -> GapContent:
         """Return the most likely content of a gap."""
-        swing, leaves = 0.0, 1
+        swing, leaves, alone = 0.0, 1, 0
         if _DOOR_M[0] <= gap.width <= _DOOR_M[1]:
-            swing, leaves = self._swing(gap, self._near)
+            swing, leaves, alone = self._swing(gap, self._near)
             if swing < _ARC:
-                swing, leaves = self._swing(gap, self._near_hairlines, is_pale=True)
+                swing, leaves, _ = self._swing(gap, self._near_hairlines, is_pale=True)
         found = GapContent("swing", swing, leaf_m=gap.width / leaves)
         if swing > _ARC and leaves == 1:
             return found
@@ -101,48 +101,51 @@ class GapReader:
             return GapContent("pane", share, warmth, lines)
         if lines == 1 and share >= _ONE_LINE:
             return GapContent("line", share, warmth, lines)
+        if alone:
+            return GapContent("leaf", _ARC, leaf_m=gap.width / alone)
         return GapContent("nothing", 1.0 - max(swing, share if lines else 0.0))
 
-    def _swing(self, gap: Gap, near: Mask, *, is_pale: bool = False) -> tuple[float, int]:
-        """Return the drawn share of the best symbol of a door in a gap, and the number of its leaves.
+    def _swing(self, gap: Gap, near: Mask, *, is_pale: bool = False) -> tuple[float, int, int]:
+        """Return the drawn share of the best symbol of a door in a gap, its leaves, and the leaves without an arc.
 
-        It is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open, or such a
-        leaf alone. A pale arc must stand out from what is drawn beside it.
+        The symbol is a quarter circle about an end of the gap, or a part of it up to a leaf that stands half open. A
+        pale arc must stand out from what is drawn beside it, and a leaf without an arc touches nothing. What lies
+        within the wall is not compared: the lines of a window would match any arc.
         """
-        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
-        width = math.dist(start, end)
-        along = (end - start) / width
-        half = 0.5 * self._finer * gap.shape.area / gap.width / self._ink.metres_per_pixel
-        angles, reach = np.radians(np.arange(12.0, 91.0, 2.0)), np.arange(0.16, 1.25, 0.04)
+        half, reach = 0.5 * gap.shape.area / gap.width**2, np.arange(0.16, 1.25, 0.04)
         # Number of leaves, side, hinge, its place across the wall, angle, and distance from the hinge.
         count, side, hinge, offset, angle, distance = np.meshgrid(
-            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], angles, reach, indexing="ij", sparse=True
-        )
-        radius = width / count * distance
-        x = width * hinge + (1.0 - 2.0 * hinge) * radius * np.cos(angle)
-        y = offset + side * radius * np.sin(angle)
-        columns = (start[0] + 1.0 + x * along[0] - y * along[1]).astype(np.intp)
-        rows = (start[1] + 1.0 + x * along[1] + y * along[0]).astype(np.intp)
-        is_inked = near[rows.clip(0, near.shape[0] - 1), columns.clip(0, near.shape[1] - 1)]
+            [1.0, 2.0], [1.0, -1.0], [0.0, 1.0], [half, 0.0, -half], np.radians(np.arange(12.0, 103.0, 2.0)), reach,
+            indexing="ij", sparse=True,
+        )  # fmt: skip
+        x = hinge + (1.0 - 2.0 * hinge) * distance / count * np.cos(angle)
+        y = offset + side * distance / count * np.sin(angle)
+        start, end = self._finer * self._ink.to_pixels(np.array([gap.start, gap.end]))
+        columns, rows = (start[k] + 1.0 + x * (end - start)[k] + (2 * k - 1) * y * (end - start)[1 - k] for k in (0, 1))
+        inside = (rows.clip(0, near.shape[0] - 1).astype(np.intp), columns.clip(0, near.shape[1] - 1).astype(np.intp))
+        is_inked = near[inside] & (np.abs(y) > half)
         # Radii are 0.92, 0.96, 1 and 1.04 of the width, and angles of the arc are at most 82 degrees.
-        arcs, leaves = is_inked[..., :36, 19:23], is_inked[..., :21].mean(axis=-1)
+        arcs = is_inked[..., :36, 19:23]
+        leaves = is_inked[..., :21].mean(axis=-1)
         shares = arcs.mean(axis=-2)
         if is_pale:
             beside = np.maximum(is_inked[..., :36, 15:19].mean(axis=-2), is_inked[..., :36, 23:27].mean(axis=-2))
             shares = np.where(beside <= _BESIDE, shares, 0.0)
-        has_leaf = (shares >= _ARC_WITH_LEAF) & (leaves[..., -1:] >= _LEAF)
+        has_leaf = (shares >= _ARC_WITH_LEAF) & (leaves[..., 39:40] >= _LEAF)
         shares = np.where(has_leaf, np.maximum(shares, _ARC), shares)
-        # Leaves at 24 to 76 degrees, and the arc up to six degrees before each.
+        # Leaves at 24 to 90 degrees with nothing beside them, and the arc up to six degrees before those to 76 degrees.
+        outer, tips = is_inked[..., 9:21].mean(axis=-1), is_inked[..., 19:23].mean(axis=-1)
+        beside, at_tip = (np.maximum(part[..., :34], part[..., 12:]) for part in (outer, tips))
+        is_free = np.maximum(beside, is_inked[..., 6:40, 25:].mean(axis=-1)) <= _BESIDE
         up_to = (np.cumsum(arcs, axis=-2) / np.arange(1, 37)[:, None])[..., 3:30, :].max(axis=-1)
-        leaf, outer = leaves[..., 6:33], is_inked[..., 9:21].mean(axis=-1)
-        beside = np.maximum(outer[..., :27], outer[..., 12:39])
-        ends = is_inked[..., 6:33, 24:].mean(axis=-1) <= _BESIDE
-        is_slanted = (beside <= _BESIDE) & ends & (leaf >= np.where(up_to >= _ARC, _LEAF, _LEAF_ALONE))
-        slanted = np.where(is_slanted, np.maximum(0.5 * (leaf + up_to), _ARC), 0.0)
+        leaf = leaves[..., 6:33]
+        slanted = np.where(is_free[..., :27] & (up_to >= _ARC) & (leaf >= _LEAF), 0.5 * (leaf + up_to), 0.0)
         best = np.maximum(shares.max(axis=(-2, -1)), slanted.max(axis=(-2, -1)))
+        alone = (is_free & (at_tip <= _BESIDE) & (leaves[..., 6:40] >= _LEAF_ALONE)).any(axis=(-2, -1))
         # Both of two leaves must be visible.
         one, two = float(best[0].max()), float(best[1].min(axis=-1).max())
-        return (two, 2) if two > one else (one, 1)
+        without_arc = 1 if alone[0].any() else 2 * int(alone[1].all(axis=-1).any())
+        return (two, 2, without_arc) if two > one else (one, 1, without_arc)
 
     def _lines(self, gap: Gap, bow: float = 0.0) -> tuple[int, float, float, int]:
         """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
@@ -206,62 +209,34 @@ def windows_in_walls(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[S
     """Return the windows: groups of panes that lie side by side in a wall. `check_time` raises an exception to stop."""
     if walls.cavities is None:
         return []
-    panes = _panes(walls, ink, check_time)
+    # Cavities outside the walls are furniture.
+    cavities = replace(ink, mask=~(walls.mask & (walls.cavities > 0)))
+    thinnest_m, thickest_m = (share * walls.thickness_m for share in _OF_WALL)
+    panes = [
+        strip
+        for strip in closed_shapes(cavities, (_FULL * _MIN_LENGTH_M * thinnest_m, math.inf))
+        if strip.long_m >= max(_MIN_LENGTH_M, _LONG * strip.short_m)
+        and thinnest_m <= strip.short_m - ink.metres_per_pixel <= thickest_m
+        and strip.filled >= _FULL
+    ]
     found: list[SketchedOpening] = []
     while panes:
         check_time()
-        (first, angle), *others = panes
-        group, panes = [first], []
-        for second, second_angle in others:
-            apart = abs((angle - second_angle + 90.0) % 180.0 - 90.0)
-            if apart < _SLANTED_DEG and _side_by_side(group[-1], second, ink, walls):
-                group.append(second)
-            else:
-                panes.append((second, second_angle))
-        if len(group) >= 2:
-            ends = opening_line(shapely.MultiPoint(ink.to_plan(np.concatenate(group))).convex_hull)
+        group = [panes[0]]
+        for pane in panes[1:]:
+            if _side_by_side(group[-1], pane, 0.5 * walls.thickness_m):
+                group.append(pane)
+        panes = [pane for pane in panes if pane not in group]
+        if _PANES[0] <= len(group) <= _PANES[1]:
+            ends = opening_line(shapely.Polygon(Shape.around(group).box))
             assert ends is not None
             found.append(SketchedOpening("window", *ends))
     return found
 
 
-def _panes(walls: WallMask, ink: Ink, check_time: CheckTime) -> list[tuple[np.ndarray, float]]:
-    """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
-    assert walls.cavities is not None
-    # Cavities outside the walls are furniture.
-    rows, columns = np.nonzero(np.where(walls.mask, walls.cavities, 0))
-    labels = walls.cavities[rows, columns]
-    order = np.argsort(labels, kind="stable")
-    points, begins = np.column_stack([columns, rows])[order], np.flatnonzero(np.diff(labels[order], prepend=0))
-    sizes, pixel_m = np.diff(begins, append=len(points)), ink.metres_per_pixel
-    thickness = walls.thickness_m / pixel_m
-    found = []
-    # Most cavities are tiny.
-    large = sizes * pixel_m >= _FULL * _MIN_LENGTH_M
-    for begin, size in zip(begins[large].tolist(), sizes[large].tolist(), strict=True):
-        part = points[begin : begin + size]
-        if (np.ptp(part, axis=0).max() + 1) * pixel_m < _MIN_LENGTH_M:
-            continue
-        check_time()
-        x0, y0 = part.min(axis=0).tolist()
-        (cx, cy), (width, height), angle = cv2.minAreaRect((part - [x0, y0]).astype(np.float32))
-        width, height = width + 1.0, height + 1.0
-        long, short = max(width, height), min(width, height)
-        if long * pixel_m < _MIN_LENGTH_M or long < _LONG * short:
-            continue
-        if not _OF_WALL[0] * thickness <= short <= _OF_WALL[1] * thickness or size < _FULL * long * short:
-            continue
-        corners = cv2.boxPoints(((cx + x0 + 0.5, cy + y0 + 0.5), (width, height), angle))
-        found.append((corners, angle if width >= height else angle + 90.0))
-    return found
-
-
-def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMask) -> bool:
-    """Return whether two strips lie along each other, one line apart."""
-    a, b = shapely.Polygon(first), shapely.Polygon(second)
-    line = 0.5 * walls.thickness_m / ink.metres_per_pixel
-    if shapely.distance(a, b) > line:
-        return False
-    lengths = sorted(side_lengths(strip)[1] for strip in (a, b))
-    shared = a.buffer(line, cap_style="square", join_style="mitre").intersection(b)
-    return lengths[0] > 0.8 * lengths[1] and shared.length > lengths[0]
+def _side_by_side(first: Shape, second: Shape, line_m: float) -> bool:
+    """Return whether two strips lie along each other, at most a line apart."""
+    shorter, longer = sorted((first.long_m, second.long_m))
+    apart = abs(float((first.centre - second.centre) @ first.axis))
+    is_alike = shorter > 0.8 * longer and apart < 0.2 * longer and abs(float(first.axis @ second.axis)) >= _PARALLEL
+    return is_alike and bool(shapely.distance(first.outline, second.outline) <= line_m)
