@@ -106,8 +106,7 @@ def find_sphere_format(thumbnail: Thumbnail) -> SphereFormat | None:
 
 def looks_spherical(pixels: UInt8[np.ndarray, "h w 3"]) -> bool:
     """Return whether a picture of any size looks like a full sphere; see `is_sphere`."""
-    height, width = COARSEST
-    return is_sphere(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA))
+    return is_sphere(cv2.resize(pixels, COARSEST[::-1], interpolation=cv2.INTER_AREA))
 
 
 def _has_ratio(pixels: np.ndarray, ratio: float) -> bool:
@@ -179,19 +178,20 @@ def _circle_parts() -> tuple[Bool[np.ndarray, "s s"], Int[np.ndarray, "s s"]]:
 
 
 def _find_stereo(thumbnail: Thumbnail) -> SphereFormat | None:
-    """Return the format of a picture with two eyes, each with a sphere or with 180° of it."""
+    """Return the format of a picture of two eyes, each with a sphere or 180° of it; photographs of 4:3 are none."""
     pixels = thumbnail.pixels
+    if _has_ratio(pixels, 4.0 / 3.0) or _has_ratio(pixels, 0.75):
+        return None
     # Made small once for both ways, as that takes longest.
     small = cv2.resize(thumbnail.grey, (2 * _EYE[1], 2 * _EYE[0]), interpolation=cv2.INTER_AREA)
     for axis, name in enumerate(("above", "beside")):
-        if not _look_alike(*_halves(small, axis)):
-            continue
-        if all(map(looks_spherical, _halves(pixels, axis))):
+        are_eyes = _look_alike(*_halves(small, axis))
+        if are_eyes and all(map(looks_spherical, _halves(pixels, axis))):
             return SphereFormat(
                 text=f"the photograph is a stereo sphere, one eye {name} the other: cut out one of them, and send it "
                 "as a picture twice as wide as high"
             )
-        if name == "beside" and _has_ratio(pixels, 2.0):
+        if are_eyes and name == "beside" and _has_ratio(pixels, 2.0):
             return SphereFormat(
                 text="the photograph is VR180, two eyes with 180° beside each other: cut out one of them, and send it "
                 "with projection=equirectangular and hfov_deg=180"
