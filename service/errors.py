@@ -200,13 +200,13 @@ class UnmeasuredModelError(ServiceError, problem=(501, "model-unmeasured", "Mode
 
 
 class UploadTooLargeError(ServiceError, problem=(413, "upload-too-large", "Upload too large")):
-    message = (
-        "the body {}; the limit is {} bytes (LALALOC_{}): send fewer files at once, photographs as JPEG, whose longer "
-        "side needs 4000 pixels at most, or a film of one turn in Full HD"
-    )
+    message = "the body {}; the limit is {} bytes (LALALOC_{}): {}"
 
     def __init__(self, setting: str, limit: int, stated: int | None = None) -> None:
-        super().__init__("is too large" if stated is None else f"has {stated} bytes", limit, setting.upper())
+        size = "is too large" if stated is None else f"has {stated} bytes"
+        is_plan = "plan" in setting or "venue" in setting
+        remedy = "divide or simplify the plan" if is_plan else "send fewer or smaller files, and a film in Full HD"
+        super().__init__(size, limit, setting.upper(), remedy)
 
 
 class BytesInFlightError(ServiceError, problem=(503, "overloaded", "Overloaded")):
