@@ -141,4 +141,4 @@ def test_turn_is_told_from_a_single_view() -> None:
     assert not model.encoder.query(first, None, CameraHeight(1.5)).is_turn
     turn = model.encoder.query(first, 0.5, CameraHeight(1.5), others=[(second, math.radians(40.0))])
     assert turn.is_turn
-    assert present(turn.searched).is_turn
+    assert present(turn.searched).value.is_turn

@@ -24,6 +24,7 @@ from lalaloc_core.localise.match.coarse_pass import CoarseTable, LowestCosts, co
 from lalaloc_core.localise.match.cost_terms import latent_distances, precisions
 from lalaloc_core.localise.match.pose_grid import SPHERE_AZIMUTHS, VIEW_AZIMUTHS, BinnedLayouts
 from lalaloc_core.localise.query import CameraHeight, Candidate, PredictedOpenings, PredictedProfile, Query, rolled
+from lalaloc_core.localise.query.query import Later
 from lalaloc_core.localise.search.retrieval import contradicted, grid_costs, resample, retrieve, vogel_disc
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from tests.strategies import plan_of, present, rectangle, seeds
@@ -198,7 +199,7 @@ class TestContradictedHeading:
             unknown_heading_query(latents), profile=PredictedProfile(turned, np.full((8, 64), -4.0))
         )
         stated = PredictedProfile(turned[:1], np.full((1, 64), -4.0))
-        return Query(latents[:1], np.zeros(1), 0.0, True, CameraHeight(1.5), stated, searched=searched)
+        return Query(latents[:1], np.zeros(1), 0.0, True, CameraHeight(1.5), stated, searched=Later(lambda: searched))
 
     def test_heading_is_kept_if_right_or_check_is_off_or_gain_small(self, grid: PoseGrid) -> None:
         right, wrong = self.query(grid, 0), self.query(grid, 3)
@@ -211,7 +212,7 @@ class TestContradictedHeading:
         wrong, config = self.query(grid, 3), MatchingConfig()
         given, searched = (
             float(grid_costs(PLAN, grid, query, MatchingWeights(), config).cost.min())
-            for query in (wrong, present(wrong.searched))
+            for query in (wrong, present(wrong.searched).value)
         )
         gain = 1.0 - searched / given
         for weights, is_contradicted in (
@@ -347,7 +348,8 @@ def view_of(query: Query, hypotheses: int = HYPOTHESES, unseen: float = np.inf) 
 def direct_coarse_costs(binned: BinnedLayouts, cost: MatchingCost, layouts: Layouts) -> np.ndarray:
     """Return the coarse costs by their definition, without tables."""
     number = np.floor(np.clip(layouts.log_profile[:, binned.columns].astype(np.float32), math.log(0.1), None) / 0.05)
-    centre, precision, odds = np.moveaxis(cost.predicted_modes(binned.columns), 2, 0)
+    modes, which = cost.predicted_modes(binned.columns)
+    centre, precision, odds = np.moveaxis(modes[which][:, :, 0], 2, 0)
     assert (odds == 1.0).all()
     (loss,), kind = present(cost.opening_costs(binned.columns)), present(layouts.kind)[:, binned.columns]
     found = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from lalaloc_core.localise.query import (
     Query,
     rolled,
 )
+from lalaloc_core.localise.query.query import Later
 
 PROFILE_OUTPUTS = ["log_profile", "log_scale"]
 # Further output of networks that predict walls as mixtures; the others then have a value for each mode.
@@ -87,7 +89,7 @@ def query_of_hypotheses(
         rest = float(wrap_angle(heading - shift * (TWO_PI / count)))
     farthest = min(math.ceil(tolerance / TWO_PI * count), (count - 1) // 2)
     query = hypotheses(shift + np.arange(-farthest, farthest + 1))
-    searched = None if query.profile is None else hypotheses(np.arange(count))
+    searched = None if query.profile is None else Later(partial(hypotheses, np.arange(count)))
     return replace(query, frame_heading=rest, heading_known=tolerance == 0.0, searched=searched)
 
 

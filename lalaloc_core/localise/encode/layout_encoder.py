@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Executor
-
 import numpy as np
 from jaxtyping import Float
 
@@ -24,13 +21,11 @@ class LayoutEncoder:
 
     Attributes:
         cohort: poses of other homes; None if the bundle has none.
-        helper: returns threads that take over a part of a query, or None if no core is idle.
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
-        self.helper: Callable[[], Executor | None] = lambda: None
         self._session = open_session(bundle.read(LAYOUT_ONNX), threads)
 
     def latents(

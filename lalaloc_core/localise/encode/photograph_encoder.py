@@ -97,7 +97,8 @@ class PhotographEncoder:
         if seen is not None and self._objects is not None:
             seen = replace(seen, lying=Later(partial(self._objects.lying, views)))
         several = {"objects": seen, "wall_directions": directions, "is_turn": bool(others)}
-        searched = None if query.searched is None else replace(query.searched, **several)
+        later = query.searched
+        searched = None if later is None else Later(lambda: replace(later.value, **several))
         return replace(query, **several, searched=searched)
 
     def with_features(self, photograph: Photograph) -> Photograph:
@@ -124,7 +125,7 @@ class PhotographEncoder:
         self, photographs: Sequence[Photograph], *, detects: bool = False
     ) -> Callable[[], list[dict[str, np.ndarray]]]:
         """Return a function that recognises the objects which an idle core, if any, has not begun; with all outputs."""
-        helper = None if self._objects is None else self.layouts.helper()
+        helper = None if self._objects is None else self.spheres.helper()
         begun = [
             Future() if helper is None else helper.submit(self._object_outputs, photograph, detects=detects)
             for photograph in photographs
@@ -186,7 +187,7 @@ class PhotographEncoder:
 
     def use_helper(self, helper: Callable[[], Executor | None]) -> None:
         """Share the work of a query with a second thread whenever `helper` returns one."""
-        self.layouts.helper = self.spheres.helper = helper
+        self.spheres.helper = helper
 
     def warm_up(self) -> None:
         """Run each network once, because the first run allocates memory."""

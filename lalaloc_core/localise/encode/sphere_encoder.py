@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -36,7 +37,7 @@ class SphereEncoder:
         predicts_profile: whether it predicts a wall profile.
         predicts_structure: whether it predicts openings, ceiling and room type.
         helper: returns threads that encode the mirror image of a sphere while the caller's encodes the sphere, or
-            None if no core is idle: one after the other, as a batch, they take less processor time.
+            None if no core is idle.
     """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0, outputs_only: bool = False) -> None:
@@ -167,13 +168,12 @@ class SphereEncoder:
     def _run_with_mirrored(
         self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, outputs: list[str]
     ) -> list[np.ndarray]:
-        """Run the network on a batch of a sphere and its mirror image; return some outputs."""
-        both, helper = np.stack([image, image[:, ::-1]]), self.helper()
-        if helper is None:
-            return self.run(both, camera_height_m, outputs)
-        mirrored = helper.submit(self.run, both[1:], camera_height_m, outputs)
-        own = self.run(both[:1], camera_height_m, outputs)
-        return [np.concatenate(pair) for pair in zip(own, mirrored.result(), strict=True)]
+        """Run the network on a sphere and its mirror image, which takes less time than a batch; return some outputs."""
+        run_mirrored, helper = partial(self.run, image[None, :, ::-1], camera_height_m, outputs), self.helper()
+        mirrored = None if helper is None else helper.submit(run_mirrored)
+        own = self.run(image[None], camera_height_m, outputs)
+        other = run_mirrored() if mirrored is None else mirrored.result()
+        return [np.concatenate(pair) for pair in zip(own, other, strict=True)]
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:

@@ -56,11 +56,13 @@ class CoarseTable:
         hypotheses: number of hypotheses.
     """
 
-    def __init__(self, binned: BinnedLayouts, matching_cost: MatchingCost) -> None:
-        self.hypotheses, self._offsets = matching_cost.hypotheses, len(matching_cost.offsets)
-        self._room_costs, self._trust_number = matching_cost.room_costs, matching_cost.trust_number
+    def __init__(self, binned: BinnedLayouts, matching_cost: MatchingCost, *, usual_height: bool = False) -> None:
+        offsets = matching_cost.offsets
+        tried = np.argsort(np.abs(offsets), kind="stable")[: 1 if usual_height else len(offsets)]
+        self.hypotheses, self._offsets = matching_cost.hypotheses, len(tried)
+        self._room_costs, self._trust_number = matching_cost.room_costs[tried], matching_cost.trust_number
         azimuths = len(binned.columns)
-        cost, which = _wall_costs(binned, matching_cost)
+        cost, which = _wall_costs(binned, matching_cost, offsets[tried])
         is_told = np.any(cost != 0.0, axis=(0, 1))[which]
         self._sectors = [
             _sector(cost, which[:, part], np.any(is_told[:, part], axis=1)) for part in binned.sectors_of_azimuths
@@ -131,19 +133,17 @@ class CoarseTable:
 
 
 def _wall_costs(
-    binned: BinnedLayouts, matching_cost: MatchingCost
+    binned: BinnedLayouts, matching_cost: MatchingCost, offsets: Float[np.ndarray, "j"]
 ) -> tuple[Float[np.ndarray, "b j d"], Int[np.ndarray, "k a"]]:
-    """Return the costs of the bins under every δ for the d different predictions, and which of them holds where."""
-    # Hypotheses are one prediction, turned, so there are few different ones at an azimuth.
-    modes = matching_cost.predicted_modes(binned.columns)
-    different, which = _different(modes.reshape(-1, modes.shape[2]))
-    apart = binned.bins[:, None, None] - matching_cost.offsets.astype(np.float32)[:, None]
+    """Return the costs of the bins under some δ for the d different predictions, and which of them holds where."""
+    different, which = matching_cost.predicted_modes(binned.columns)
+    apart = binned.bins[:, None, None] - offsets.astype(np.float32)[:, None]
     likelihood = sum(
         odds / (1.0 + np.square((apart - centre) * precision))
-        for centre, precision, odds in different.reshape(len(different), -1, 3).transpose(1, 2, 0)
+        for centre, precision, odds in different.transpose(1, 2, 0)
     )
     cost = -np.log(np.minimum(likelihood, 1.0)) / len(binned.columns)
-    return cost.astype(np.float32, copy=False), which.reshape(modes.shape[:2])
+    return cost.astype(np.float32, copy=False), which
 
 
 def _sector(cost: Float[np.ndarray, "b j d"], which: Int[np.ndarray, "k a"], is_told: Bool[np.ndarray, "k"]) -> _Sector:
@@ -192,14 +192,6 @@ def _least(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n l"]:
 
 def _floored(values: Float[np.ndarray, "n l"], scale: float) -> Int[np.ndarray, "n l"]:
     return np.floor(values * scale).astype(np.int16)
-
-
-def _different(rows: Float[np.ndarray, "n v"]) -> tuple[Float[np.ndarray, "d v"], Int[np.ndarray, "n"]]:
-    """Return the different rows, and which of them each row is; as `np.unique`, which compares column by column."""
-    rows = np.ascontiguousarray(rows)
-    whole = rows.view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
-    _, first, which = np.unique(whole, return_index=True, return_inverse=True)
-    return rows[first], which
 
 
 class LowestCosts:
@@ -292,10 +284,10 @@ def likeliest(
 
 
 def coarse_costs(
-    binned: BinnedLayouts, matching_cost: MatchingCost, room_index: Int[np.ndarray, "n"]
+    binned: BinnedLayouts, matching_cost: MatchingCost, room_index: Int[np.ndarray, "n"], *, usual_height: bool = False
 ) -> Float[np.ndarray, "n k"]:
-    """Return the coarse costs of all poses under all hypotheses, each at its best δ."""
-    table = CoarseTable(binned, matching_cost)
+    """Return the coarse costs of all poses under all hypotheses, each at its best δ, or at that of the usual height."""
+    table = CoarseTable(binned, matching_cost, usual_height=usual_height)
     costs, first = [], 0
     for part in binned.parts:
         costs.append(table.costs(part, room_index[first : first + len(part)]))

@@ -23,18 +23,18 @@ _FEW_SEEN = 0.75
 
 
 class WallMode(NamedTuple):
-    """Mode of the predicted walls: centres, precisions and odds, each (k, w) or broadcast to that."""
+    """Mode of the predicted walls: centres, precisions and odds."""
 
     centre: Float[np.ndarray, "k w"]
     precision: Float[np.ndarray, "k w"]
-    odds: Float[np.ndarray, "#k #w"]
+    odds: Float[np.ndarray, "k w"]
 
     @classmethod
     def of(
         cls,
         log_m: Float[np.ndarray, "k w"],
         log_scale: Float[np.ndarray, "k w"],
-        odds: Float[np.ndarray, "#k #w"],
+        odds: Float[np.ndarray, "k w"],
         reach_m: float,
         tail: float,
         stride: int,
@@ -43,9 +43,9 @@ class WallMode(NamedTuple):
         values = log_m, precisions(log_m, log_scale, reach_m, tail), odds
         return cls(*(np.ascontiguousarray(value[:, ::stride], np.float32) for value in values))
 
-    def spread(self) -> WallMode:
-        """Return the mode with odds for every column."""
-        return self._replace(odds=np.ascontiguousarray(np.broadcast_to(self.odds, self.centre.shape)))
+    def turned(self, columns: Int[np.ndarray, "k w"]) -> WallMode:
+        """Return the mode, of one hypothesis, with columns of it for each of several."""
+        return WallMode(*(value[0].take(columns) for value in self))
 
     def at(self, columns: Int[np.ndarray, "k s"]) -> WallMode:
         """Return the mode, of all values, at some columns of each hypothesis."""
@@ -54,7 +54,7 @@ class WallMode(NamedTuple):
     def likelihood(self, log_m: np.ndarray, place: Any) -> np.ndarray:
         """Return the likelihoods of log distances at places: an index into (k, w)."""
         centre, precision = self.centre[place], self.precision[place]
-        return np.broadcast_to(self.odds, self.centre.shape)[place] / (1.0 + np.square((log_m - centre) * precision))
+        return self.odds[place] / (1.0 + np.square((log_m - centre) * precision))
 
     def likelihood_at(self, log_m: Float[np.ndarray, "n"], place: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
         """Return the likelihoods of log distances at flat places."""
@@ -82,11 +82,11 @@ class SeenWalls(NamedTuple):
         count = -(-max(int(is_seen.sum(axis=1).max(initial=0)), 1) // _FACTORS) * _FACTORS
         if count > _FEW_SEEN * width:
             every = np.broadcast_to(np.arange(width), (hypotheses, width))
-            return cls(tuple(mode.spread() for mode in modes), every, every)
+            return cls(tuple(modes), every, every)
         columns = np.argsort(~is_seen, axis=1, kind="stable")[:, :count]
         place = np.full((hypotheses, width), -1)
         np.put_along_axis(place, columns, np.arange(count), axis=1)
-        return cls(tuple(mode.spread().at(columns) for mode in modes), columns, place)
+        return cls(tuple(mode.at(columns) for mode in modes), columns, place)
 
 
 def precisions(

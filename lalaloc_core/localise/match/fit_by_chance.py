@@ -120,7 +120,7 @@ def cost_by_chance(
     matching_cost = MatchingCost(plan, query, reach_m, weights, general)
     binned = cohort.binned_for_views if query.is_view else cohort.binned
     layouts = replace(cohort.layouts, room_index=np.full(len(cohort.layouts), room))
-    coarse = coarse_costs(binned, matching_cost, layouts.room_index)
+    coarse = coarse_costs(binned, matching_cost, layouts.room_index, usual_height=True)
     hypothesis = coarse.argmin(axis=1)
     pose = np.argsort(coarse[np.arange(len(coarse)), hypothesis], kind="stable")[:_COMPARED]
     by_chance, _ = matching_cost.pairs(layouts, pose, hypothesis[pose])

@@ -155,9 +155,14 @@ class MatchingCost:
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
-        modes = [(first.log_m, first.log_scale, np.ones((1, 1)))]
-        modes += [] if rival is None else [(rival.log_m, rival.log_scale, rival.odds)]
-        self._modes = [WallMode.of(*mode, reach_m, weights.tail, stride) for mode in modes]
+        values = [first.log_m, first.log_scale, np.ones_like(first.log_m)]
+        values += [] if rival is None else [rival.log_m, rival.log_scale, rival.odds]
+        # Hypotheses are mostly one prediction, turned, of which everything is computed once.
+        self._turned = self._turned_columns(np.stack(values, axis=2)) if stride == 1 else None
+        values = values if self._turned is None else [value[:1] for value in values]
+        modes = (values[index : index + 3] for index in range(0, len(values), 3))
+        self._turning = [WallMode.of(*mode, reach_m, weights.tail, stride) for mode in modes]
+        self._modes = [mode if self._turned is None else mode.turned(self._turned) for mode in self._turning]
         self._first = self._modes[0]
 
     def costs(
@@ -260,11 +265,14 @@ class MatchingCost:
         types = self._weights.room_type * self._room_types
         return (penalty + self._weights.ceiling * self._ceilings(self.offsets) + types).astype(np.float32)
 
-    def predicted_modes(self, columns: Int[np.ndarray, "a"]) -> Float[np.ndarray, "k a v"]:
-        """Return the predictions of walls at some azimuths: centre, precision and odds of each mode."""
-        shape = self._first.centre[:, columns].shape
-        values = [np.broadcast_to(part, self._first.centre.shape)[:, columns] for mode in self._modes for part in mode]
-        return np.stack(values, axis=2).reshape(*shape, -1)
+    def predicted_modes(
+        self, columns: Int[np.ndarray, "a"]
+    ) -> tuple[Float[np.ndarray, "d m 3"], Int[np.ndarray, "k a"]]:
+        """Return predictions of walls, centre, precision and odds of each mode, and which of them are at azimuths."""
+        predicted = np.stack([np.stack(mode, axis=-1) for mode in self._turning], axis=2)
+        which = np.arange(predicted.shape[0] * predicted.shape[1]).reshape(predicted.shape[:2])
+        turned = which if self._turned is None else self._turned
+        return predicted.reshape(-1, *predicted.shape[2:]), turned[:, columns]
 
     @property
     def trust_number(self) -> Int[np.ndarray, "r"]:
@@ -377,7 +385,6 @@ class MatchingCost:
             return None
         # Openings appear displaced by up to the reach, seen at the median distance.
         median_m = median_distance_m(self._first.centre[0], self._first.precision[0])
-        # Hypotheses are mostly one prediction, turned, whose losses are computed once.
         turned = self._turned_columns(predicted.log_probability) if self._stride == 1 else None
         log_probability = predicted.log_probability if turned is None else predicted.log_probability[:1]
         probability = smoothed(np.exp(log_probability), self._reach_m / median_m)

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,6 +26,7 @@ from lalaloc_core.floorplan import FloorPlan
 # Types of rooms that are less probable are not named.
 _MIN_PROBABILITY = 0.05
 HeadingSource = Literal["given", "photograph", "searched"]
+T = TypeVar("T")
 # Largest error (degrees) of the compass heading in a photograph's metadata.
 _COMPASS_TOLERANCE_DEG = 20.0
 # Range of unknown camera heights (m) over the floor, all equally likely.
@@ -279,18 +281,18 @@ class WallDirection:
 
 
 @dataclass(eq=False)
-class Later:
-    """Warnings that are computed when they are read, or sent to another process: only answers that are not sure do."""
+class Later(Generic[T]):
+    """Value that is computed when it is read, or sent to another process: few answers need it."""
 
-    compute: Callable[[], tuple[str, ...]]
+    compute: Callable[[], T]
 
     @cached_property
-    def warnings(self) -> tuple[str, ...]:
-        """The warnings."""
+    def value(self) -> T:
+        """The value."""
         return self.compute()
 
-    def __reduce__(self) -> tuple[type[Later], tuple[Any]]:
-        return Later, (partial(tuple, self.warnings),)
+    def __reduce__(self) -> tuple[type[Later[T]], tuple[Any]]:
+        return Later, (partial(copy, self.value),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +309,7 @@ class SeenObjects:
     room_type: PredictedRoomType
     objects: tuple[SeenObject, ...]
     outside: float = 0.0
-    lying: Later | None = None
+    lying: Later[tuple[str, ...]] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,7 +346,7 @@ class Query:
     room_type: PredictedRoomType | None = None
     objects: SeenObjects | None = None
     wall_directions: tuple[WallDirection, ...] = ()
-    searched: Query | None = None
+    searched: Later[Query] | None = None
     is_view: bool = False
     is_turn: bool = False
 
@@ -360,7 +362,7 @@ class Query:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings by what the photograph shows."""
-        return () if self.objects is None or self.objects.lying is None else self.objects.lying.warnings
+        return () if self.objects is None or self.objects.lying is None else self.objects.lying.value
 
     @property
     def sector(self) -> float:

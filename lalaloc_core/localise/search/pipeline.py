@@ -276,18 +276,10 @@ class _Search:
         self._plan, self._grid, self._encoders, self._config = plan, grid, encoder, config
         weights, matching = encoder.manifest.evidence_for(view=query.is_view), config.matching
         self._weights, self._clock, self._hints, self._top_k = weights, clock, hints, top_k
-
-        def by_chance(query: Query, room: int) -> float | None:
-            reach_m = matching.grid_reach * grid.step_m
-            return cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching, room=room)
-
         with clock.stage("retrieve"):
-            # Of a merged plan, it depends on the room that is found.
-            helper = None if plan.room_trust else encoder.helper()
-            beside = None if helper is None else helper.submit(by_chance, query, 0)
             costs = grid_costs(plan, grid, query, weights, matching) if hints.are_none else None
             doubted = not hints.strict and contradicted(plan, grid, query, weights, matching, given=costs)
-            query = query.searched if doubted and query.searched is not None else query
+            query = query.searched.value if doubted and query.searched is not None else query
             if costs is None or doubted:
                 costs = grid_costs(plan, grid, query, weights, matching, hints)
             # Refined candidates can meet and become one; spare ones then take their places.
@@ -301,7 +293,9 @@ class _Search:
                 margin=config.alike_margin,
                 limit=config.max_candidates + top_k,
             )
-            chance = by_chance(query, modes[0].room_index) if beside is None or doubted else beside.result()
+            # On another thread it would take longer, as both would wait for the interpreter's lock.
+            reach_m, room = matching.grid_reach * grid.step_m, modes[0].room_index
+            chance = cost_by_chance(encoder.cohort, plan, query, reach_m, weights, matching, room=room)
         self.query, self._costs, self._by_chance, self._doubted = query, costs, chance, doubted
         self.by_walls = matching.compares_profiles(query)
         self.retrieved = _Stage("retrieval", modes, modes)

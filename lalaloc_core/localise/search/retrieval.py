@@ -209,14 +209,17 @@ def contradicted(
     is kept where its best place fits as well as right headings do, and where the search fits better by no more than
     beside right headings (`MatchingWeights.usual_cost`, `usual_gain`).
     """
-    searched = query.searched
-    if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
+    if query.searched is None or not config.compares_profiles(query) or not config.heading_doubt:
         return False
-    doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
     given = grid_costs(plan, grid, query, weights, config) if given is None else given
     best = int(given.cost[: given.compared].argmin())
+    odds = (1.0 - config.heading_doubt) / config.heading_doubt
+    if given.cost[best] <= max(np.log(odds) / weights.temperature, weights.usual_cost):
+        return False
+    searched = query.searched.value
+    doubt = np.log(odds * len(searched.roll)) / weights.temperature
     # Costs are non-negative, so no heading is better by more than the given one's cost.
-    if given.cost[best] <= max(doubt, weights.usual_cost):
+    if given.cost[best] <= doubt:
         return False
     # One camera height, the best at the given heading, is accurate enough to compare headings.
     offset = float(given.offset[best])
