@@ -57,34 +57,38 @@ def _all_markers(content: bytes) -> Iterator[tuple[int, int]]:
             position += int.from_bytes(content[position : position + 2], "big")
 
 
-def count_scans(content: bytes, limit: int) -> int:
-    """Count the scans of a JPEG, up to `limit` + 1; return 0 for other files.
+def count_scans(content: bytes, limit: int) -> tuple[int, bool]:
+    """Count the scans of a JPEG, up to `limit` + 1, and tell whether its last bytes are missing.
 
     A scan of a few bytes makes the decoder visit every block of the picture again, so a small file can keep it busy for
     minutes.
     """
-    if not content.startswith(START):
-        return 0
-    scans = (marker for marker, _ in markers(content) if marker == START_OF_SCAN)
-    return sum(1 for _ in islice(scans, limit + 1))
+    count = 0
+    for marker, _ in _all_markers(content):
+        if marker == END_OF_IMAGE or count > limit:
+            return count, False
+        count += marker == START_OF_SCAN
+    return count, True
 
 
-def check_segments(content: bytes, max_scans: int) -> None:
-    """Refuse a JPEG or PNG with too many segments, before the first scan, scans or chunks; other files pass."""
-    kind, counts = "JPEG", list[tuple[int, int, str]]()
+def check_segments(content: bytes, max_scans: int) -> bool:
+    """Refuse a JPEG or PNG with too many segments, scans or chunks; return whether a JPEG's last bytes are missing."""
+    kind, counts, is_cut = "JPEG", list[tuple[int, int, str]](), False
     if content.startswith(START):
         head = takewhile(lambda found: found[0] != START_OF_SCAN, markers(content))
         segments = list(islice(head, _MAX_SEGMENTS + 1))
         exif = sum(marker == APP1 and content.startswith(b"Exif\0\0", place + 2) for marker, place in segments)
         counts = [(exif, _MAX_EXIF_SEGMENTS, "Exif segments, the limit")]
         counts += [(len(segments), _MAX_SEGMENTS, "segments, the limit")]
-        counts += [(count_scans(content, max_scans), max_scans, "scans, the limit (max_scans)")]
+        scans, is_cut = count_scans(content, max_scans)
+        counts += [(scans, max_scans, "scans, the limit (max_scans)")]
     elif content.startswith(_PNG):
         kind, chunks = "PNG", sum(1 for _ in islice(png_chunks(content), _MAX_CHUNKS + 1))
         counts = [(chunks, _MAX_CHUNKS, "chunks, the limit")]
     for count, limit, parts in counts:
         if count > limit:
             raise InvalidPhotographError(f"the photograph is a {kind} with more than {limit} {parts}; save it again")
+    return is_cut
 
 
 def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
@@ -94,11 +98,6 @@ def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
         end = position + _CHUNK_FRAME + int.from_bytes(content[position : position + 4], "big")
         yield content[position + 4 : position + 8], position, end
         position = end
-
-
-def lacks_end(content: bytes) -> bool:
-    """Return whether a JPEG has no marker of its end, so that its last bytes are missing."""
-    return content.startswith(START) and all(marker != END_OF_IMAGE for marker, _ in _all_markers(content))
 
 
 def without_large_texts(content: bytes) -> tuple[bytes, int]:

@@ -25,8 +25,9 @@ from lalaloc_core.photograph.exif import stated_sizes
 from lalaloc_core.photograph.file_segments import (
     END,
     MAX_TEXT_BYTES,
+    START,
     check_segments,
-    lacks_end,
+    count_scans,
     without_large_texts,
     xmp_packets,
 )
@@ -116,8 +117,7 @@ def opened_picture(content: bytes, limits: PhotographLimits) -> Iterator[Picture
     if not content:
         raise InvalidPhotographError("the photograph is empty; if it is still in a cloud, download it first")
     _check_webp_size(content, limits)
-    check_segments(content, limits.max_scans)
-    is_cut = lacks_end(content)
+    is_cut = check_segments(content, limits.max_scans)
     # Without its end, the decoder refuses all of the picture.
     readable, left_out = (content + END, 0) if is_cut else without_large_texts(content)
     with _named_errors(content, limits), Image.open(io.BytesIO(readable), formats=_formats(content)) as image:
@@ -303,7 +303,7 @@ def _named_errors(content: bytes, limits: PhotographLimits) -> Iterator[None]:
     except MemoryError as error:
         raise InvalidPhotographError("there is not enough memory to decode the photograph; scale it down") from error
     except _DAMAGE as error:
-        if lacks_end(content):
+        if content.startswith(START) and count_scans(content, limits.max_scans)[1]:
             raise InvalidPhotographError(
                 "the photograph's file ends before its picture does, and too little of it can be decoded: send the "
                 "whole file"
