@@ -43,7 +43,7 @@ export function showError(place: HTMLElement, error: unknown, fields: Fields = {
     detail = plainWords(failure?.detail ?? text);
   show(
     place,
-    title !== null && h("strong", {}, title),
+    title !== null && h("strong", {}, plainWords(title)),
     h("p", {}, plain ? `${plain} (${detail})` : detail),
     faults.length > 0 &&
       h(

@@ -185,10 +185,7 @@ export class LiveSession {
     const { id, box } = this.plan,
       unit = unitOf(box),
       pose = session?.pose ?? null;
-    if (session === null || pose === null || id === undefined) {
-      show(this.layer);
-      return;
-    }
+    if (session === null || pose === null || id === undefined) return show(this.layer);
     const isHere = (at: { floorplan_id?: string | null }): boolean => (at.floorplan_id ?? session.floorplan_id) === id;
     const path = session.path.filter(isHere).map(({ position }) => position);
     const { x_m, y_m } = pose.position;

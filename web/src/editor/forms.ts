@@ -138,9 +138,10 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: EditActio
   const hint = current.ceiling_height_m == null ? ASSUMED : `${current.ceiling_height_m} of the plan`;
   return [
     h("h3", {}, "Room"),
-    text("room-form-name", "Name", room.name ?? "", (name) =>
-      set({ name, types: room.types?.length ? room.types : undefined }),
-    ),
+    text("room-form-name", "Name", room.name ?? "", (name) => {
+      set({ name, types: room.types?.length ? room.types : undefined });
+      if ((room.type ?? "unknown") !== "unknown") say(`The type stays ${room.type}; “unknown” takes it from the name.`);
+    }),
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) =>
       set({ type, types: type === "unknown" ? [] : undefined }),
     ),
