@@ -159,8 +159,7 @@ export class LiveSession {
 
   private describe({ mode, pose, photographs, id }: Session): void {
     const others = (pose?.candidates ?? []).slice(1).filter(({ probability }) => probability >= MIN_SHARE);
-    const level = (at: { level?: number | null }): string =>
-      at.level === null || at.level === undefined ? "" : `, level ${at.level}`;
+    const level = (at: { level?: number | null }): string => (at.level == null ? "" : `, level ${at.level}`);
     const possible = others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`);
     show(
       this.state,

@@ -36,18 +36,24 @@ const PLACES = "latitude, longitude of x 0, y 0, or x, y, latitude, longitude of
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
+let later: number | undefined;
+
 export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: EditActions): void {
-  if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
-    // The form already shows the typed text.
-    if (place.dataset.of === JSON.stringify(selection)) return;
-  }
-  place.dataset.of = JSON.stringify(selection);
-  const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
-  const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
-  if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
-  else if (opening !== undefined && selection.kind === "opening")
-    show(place, ...openingForm(opening, selection.index, actions));
-  else show(place, ...planForm(plan, actions));
+  const draw = (): void => {
+    const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
+    const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
+    if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
+    else if (opening !== undefined && selection.kind === "opening")
+      show(place, ...openingForm(opening, selection.index, actions));
+    else show(place, ...planForm(plan, actions));
+  };
+  const isTyping = (): boolean => place.contains(document.activeElement?.closest("input, select") ?? null),
+    of = JSON.stringify(selection);
+  clearTimeout(later);
+  if (place.dataset.of !== of || !place.hasChildNodes()) draw();
+  // A field that is left changes the plan before the next one has the focus; that shows what is typed.
+  else later = window.setTimeout(() => place.hasChildNodes() && !isTyping() && draw());
+  place.dataset.of = of;
 }
 
 let current: PlanDocument = { rooms: [] };
