@@ -7,7 +7,6 @@ import csv
 import io
 import json
 import logging
-import math
 import threading
 import time
 import zipfile
@@ -33,7 +32,6 @@ from lalaloc_core.localise.album.pins import Album, Pin, PinPose, RoomShare, Sug
 from lalaloc_core.localise.encode.features import FeatureEncoder
 from lalaloc_core.localise.encode.photograph_encoder import sphere_size
 from lalaloc_core.photograph import open_photograph
-from lalaloc_core.photograph.cameras import Perspective
 from service.albums import album_solver
 from service.albums.album_solver import AlbumSolver
 from service.errors import UnanchoredPlanError
@@ -47,7 +45,8 @@ from service.storage.store import Store
 from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS
 from service.telemetry import LOGGER_NAME
-from tests.core.taken import EXAMPLES, jpeg, sphere, take
+from tests.core.filmed import turn
+from tests.core.taken import EXAMPLES, jpeg
 from tests.painted import picture_file
 from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, lines_of, pages, upload, wait_for
 from tests.service.test_security import bearer, make_key
@@ -144,9 +143,7 @@ def test_photographs_get_pins_together(client: httpx.Client, solved: str, plan_i
 
 
 def test_pins_are_those_of_the_command_line(client: httpx.Client, plan_id: str, tmp_path: Path) -> None:
-    views = [(name[:-4], 100.0 * number) for name in NAMES[2:] for number in range(3)]
-    camera = Perspective.of_hfov(640, 480, math.radians(90.0))
-    files = [jpeg(take(sphere(name), camera, heading_deg=heading), {0xA405: 18}) for name, heading in views]
+    files = [jpeg(frame) for frame in turn()[::10]]
     album_id = create(client, plan_id)
     add(client, album_id, files)
     wait_until_solved(client, album_id)

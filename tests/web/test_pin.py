@@ -111,8 +111,8 @@ def test_menu_lists_more_folders_than_a_page_of_the_list_has(desktop: Visit) -> 
 
 
 @pytest.mark.slow
-def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -> None:
-    page = pin_files(desktop, [grey, FILES[1]])
+def test_uncertain_photographs_are_decided_by_keys_and_printed(desktop: Visit, grey: Path) -> None:
+    page = pin_files(desktop, [grey, *FILES])
     _assert_accessible(page)
     card = page.locator(".card", has_text="grey.jpg")
     if card.locator(".choices").count() == 0:
@@ -133,6 +133,11 @@ def test_uncertain_photographs_are_decided_by_keys(desktop: Visit, grey: Path) -
     kitchen.focus()
     page.keyboard.press("Enter")
     expect(kitchen).to_contain_text("kitchen, corrected")
+    document = pypdfium2.PdfDocument(io.BytesIO(page.pdf(format="A4")))
+    texts = [sheet.get_textpage().get_text_range().split("\r\n") for sheet in document]
+    assert (texts[0][0], texts[-1][0]) == ("Pinned flat", "Set aside")
+    assert {text[0] for text in texts[1:-1]} == {"living room", "kitchen", "bedroom"}
+    assert any("kitchen.jpg" in line for text in texts for line in text if text[0] == "kitchen")
 
 
 @pytest.mark.slow
@@ -294,19 +299,6 @@ def test_pins_do_not_cover_each_other_nor_walls_the_bars_of_a_screenshot(desktop
     circles = [present(page.locator(f"#pin-{number} circle").bounding_box()) for number in range(1, 6)]
     for first, second in itertools.combinations(circles, 2):
         assert math.dist((first["x"], first["y"]), (second["x"], second["y"])) > 0.95 * first["width"]
-
-
-@pytest.mark.slow
-def test_print_has_the_plan_and_a_page_per_room(desktop: Visit, grey: Path) -> None:
-    page = pin_files(desktop, [*FILES, grey])
-    page.locator(".card", has_text="grey.jpg").focus()
-    page.keyboard.press("0")
-    expect(page.locator("#photographs h3", has_text="Set aside (1)")).to_be_visible()
-    document = pypdfium2.PdfDocument(io.BytesIO(page.pdf(format="A4")))
-    texts = [sheet.get_textpage().get_text_range().split("\r\n") for sheet in document]
-    assert (texts[0][0], texts[-1][0]) == ("Pinned flat", "Set aside")
-    assert {text[0] for text in texts[1:-1]} == {"living room", "kitchen", "bedroom"}
-    assert any("kitchen.jpg" in line for text in texts for line in text if text[0] == "kitchen")
 
 
 @pytest.mark.slow
