@@ -157,7 +157,8 @@ export class Editor {
   private close(stored: Plan | null): void {
     if (stored !== null && this.history !== null) {
       const types = change.typesByName(this.history.now, stored.plan);
-      say(`“${stored.name}” is stored, revision ${stored.revision_number}.${types}`);
+      const picture = this.underlay.traced && " The picture below it stays until this page is closed.";
+      say(`“${stored.name}” is stored, revision ${stored.revision_number}.${types}${picture ?? ""}`);
       this.traced.keep(stored.id, this.underlay.traced);
     }
     this.history = null;

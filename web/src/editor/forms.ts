@@ -145,8 +145,9 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: EditActio
   return [
     h("h3", {}, "Room"),
     text("room-form-name", "Name", room.name ?? "", (name) => {
-      set({ name, types: room.types?.length ? room.types : undefined });
-      if ((room.type ?? "unknown") !== "unknown") say(`The type stays ${room.type}; “unknown” takes it from the name.`);
+      const { type, types } = current.rooms[index]!;
+      set({ name, types: types?.length ? types : undefined });
+      if ((type ?? "unknown") !== "unknown") say(`The type stays ${type}; “unknown” takes it from the name.`);
     }),
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) =>
       set({ type, types: type === "unknown" ? [] : undefined }),
