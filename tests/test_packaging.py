@@ -24,7 +24,7 @@ from scripts.write_locks import extras_of
 from service.capacity.admission_control import Admission
 from service.capacity.cores import share_cores
 from service.routes import ROUTERS
-from service.settings import PREFIX, SETTING_NAMES, Settings
+from service.settings import PREFIX, SETTING_NAMES, Settings, settings_table
 from service.telemetry import Telemetry
 
 ROOT = Path(__file__).parents[1]
@@ -144,7 +144,9 @@ def test_image_copies_existing_files_and_can_export_spans() -> None:
 def test_image_and_compose_use_known_settings() -> None:
     named = set(re.findall(r"\bLALALOC_[A-Z_]+", DOCKERFILE)) | set(COMPOSE["environment"])
     assert named - {"FORWARDED_ALLOW_IPS"} <= SETTINGS
-    assert SETTINGS - COMPOSE["environment"].keys() == {"LALALOC_BUNDLE", "LALALOC_DATA_DIR"}
+    folders = dict(re.findall(r"\b(LALALOC_[A-Z_]+)=(\S+)", DOCKERFILE))
+    assert SETTINGS - COMPOSE["environment"].keys() == folders.keys()
+    assert [name for name, path in folders.items() if not re.search(f"`{name}`.*`{path}`", settings_table())] == []
     (port,) = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, re.MULTILINE)
     assert f'"--port", "{port}"' in DOCKERFILE
     assert f"http://127.0.0.1:{port}/readyz" in DOCKERFILE

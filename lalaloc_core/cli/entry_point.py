@@ -14,7 +14,8 @@ from pathlib import Path
 from lalaloc_core import __version__
 from lalaloc_core.cli import encoding, localising, pinning, plans, tracking
 from lalaloc_core.cli.options import add_options
-from lalaloc_core.errors import ConfigError, InvalidInputError, LaLaLocError, MissingExtraError
+from lalaloc_core.cli.printing import with_options
+from lalaloc_core.errors import ConfigError, InvalidInputError, InvalidPhotographError, LaLaLocError, MissingExtraError
 
 _MCP_OPTIONS = """
 --url URL: address of the service (default: %(default)s)
@@ -57,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
         print("interrupted", file=sys.stderr)
         return _INTERRUPTED
     except (InvalidInputError, ConfigError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {with_options(error) if isinstance(error, InvalidPhotographError) else error}", file=sys.stderr)
         return 2
     except LaLaLocError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -13,7 +13,7 @@ from lalaloc_core.cli.answer_files import FILES, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, check_sources, heading, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_free, check_picture_name, read_plan, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings, with_options
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.shown_text import probability_text
 
@@ -82,7 +82,7 @@ def _localise(arguments: argparse.Namespace) -> None:
     for number, (path, answer, document) in enumerate(find(arguments, model, plan, stated)):
         documents.append(document)
         if answer is None:
-            print(f"error: {document['error']}", file=sys.stderr)
+            print(f"error: {with_options(document['error'])}", file=sys.stderr)
             continue
         warnings += [(name, text) for text in document["warnings"] for name in _names(path, document, text)]
         drawn = drawn_answer(answer)
@@ -140,7 +140,9 @@ def _turn_answers(
     files, left_out = turn_files(path) if path.is_dir() else ([], [])
     source = files if len(files) > 1 else path
     answer = model.localise_turn(plan, source, camera_height_m=arguments.camera_height, camera=stated)
-    document = {"photograph": str(path), **answer.document(), "warnings": [*left_out, *_remarks(answer)]}
+    names = [f"frame {number + 1}" if answer.film else files[number].name for number in range(len(answer.poses))]
+    remarks = [re.sub(r"photo\[(\d+)\]", lambda found: names[int(found[1])], text) for text in _remarks(answer)]
+    document = {"photograph": str(path), **answer.document(), "warnings": [*left_out, *remarks]}
     if answer.film is None:
         poses = zip(files, document["poses"], strict=True)
         document["poses"] = [{"photograph": file.name, **pose} for file, pose in poses]

@@ -12,7 +12,7 @@ from typing import Any
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, PLAN, add_options
 from lalaloc_core.cli.plan_files import add_plan_options, read_plans
-from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table, print_warnings
+from lalaloc_core.cli.printing import JSON_DECIMALS, print_json, print_table, print_warnings, with_options
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.shown_text import printable, probability_text
 
@@ -63,7 +63,7 @@ def _pin(arguments: argparse.Namespace) -> None:
     except OSError as error:
         raise InvalidInputError(f"'{arguments.out}' cannot be written: {error.strerror}") from error
     for note in (*document["notes"], *moved):
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {with_options(note)}", file=sys.stderr)
     print_warnings((row["photograph"], text) for row in document["photographs"] for text in row.get("warnings", ()))
     if arguments.json:
         print_json(document, JSON_DECIMALS)

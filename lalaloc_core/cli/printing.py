@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from functools import reduce
 from typing import Any
 
 from lalaloc_core.shown_text import printable
@@ -13,6 +14,8 @@ from lalaloc_core.shown_text import printable
 # Decimals of printed poses: micrometres, and mm² of covariances.
 JSON_DECIMALS = 6
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+# Options by what messages about photographs call them, as fields.
+_OPTIONS = {"hfov_deg": "--hfov", "projection=": "--projection ", "as one query with motion=turn": "with --turn"}
 
 
 def print_json(value: Any, decimals: int | None = None) -> None:
@@ -47,11 +50,16 @@ def print_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print(printable("  ".join([first, *others]).rstrip()))
 
 
+def with_options(message: object) -> str:
+    """Return a message about a photograph with the names of options instead of those of fields."""
+    return reduce(lambda text, field: text.replace(field, _OPTIONS[field]), _OPTIONS, str(message))
+
+
 def print_warnings(warnings: Iterable[tuple[str, str]]) -> None:
     """Print warnings, by names and texts, to standard error, each cause once: its texts differ in numbers only."""
     causes: dict[str, list[tuple[str, str]]] = {}
     for name, text in warnings:
-        causes.setdefault(_NUMBER.sub("#", text), []).append((name, text))
+        causes.setdefault(_NUMBER.sub("#", text), []).append((name, with_options(text)))
     for (name, text), *others in causes.values():
         more = len({other for other, _ in others} - {name})
         print(printable(f"warning: {name}{f' and {more} more' if more else ''}: {text}"), file=sys.stderr)

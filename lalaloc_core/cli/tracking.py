@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, add_options, heading
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_file, write_picture
-from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings
+from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings, with_options
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.shown_text import probability_text
 
@@ -138,7 +138,7 @@ def _followed(
         try:
             answer = track.add(path, motion, camera=stated)
         except InvalidPhotographError as error:
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: {with_options(error)}", file=sys.stderr)
             yield time_s, None, {"photograph": str(path), "error": str(error)}
             continue
         before_s = time_s

@@ -285,7 +285,7 @@ def bend_warnings(segments: Float[np.ndarray, "n 4"], camera: Camera) -> tuple[s
         return ()
     return (
         f"straight lines are bent by {bend:.0%} of the picture's longer side, as a fisheye lens bends them, but the "
-        "photograph is read in perspective: send projection=fisheye with hfov_deg, or intrinsics with the distortion, "
+        "photograph is read in perspective: state projection=fisheye with hfov_deg, or intrinsics with the distortion, "
         "or set the camera to its linear mode",
     )
 

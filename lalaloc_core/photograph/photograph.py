@@ -427,7 +427,7 @@ def field_warning(hfov: float, sd: float, origin: str) -> str:
     """Return the warning that a field of view (radians) is not known."""
     return (
         f"the field of view of {math.degrees(hfov):.0f}° ± {math.degrees(2.0 * sd):.0f}° {origin}; "
-        "send hfov_deg, or send the camera's original file"
+        "state hfov_deg, or send the camera's original file"
     )
 
 

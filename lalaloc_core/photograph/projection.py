@@ -48,7 +48,7 @@ _GIVEN_SD = 0.01
 _ACTION_SD = 0.05
 # Advice for photographs without a known field of view.
 _HELP = (
-    "send hfov_deg, its horizontal field of view (a phone's main lens has about 67° in landscape and 53° in portrait "
+    "state hfov_deg, its horizontal field of view (a phone's main lens has about 67° in landscape and 53° in portrait "
     "format), or intrinsics"
 )
 
@@ -115,7 +115,7 @@ def find_lens(
     if projection == "cylindrical":
         raise InvalidPhotographError(
             f"nothing tells which angle the strip of {width} x {height} shows{_UNCLOSED if sphere.cylinder else ''}; "
-            "send hfov_deg, its horizontal field of view (up to 360)"
+            "state hfov_deg, its horizontal field of view (up to 360)"
         )
     if projection == "fisheye" and exif.fisheye is not None:
         return _action_camera(width, height, unknown, exif, exif.fisheye)
@@ -197,7 +197,7 @@ def _projection(
         )
     if max(width, height) > _LONGEST * min(width, height):
         raise InvalidPhotographError(
-            f"the photograph of {width} x {height} is a strip; send projection=cylindrical and hfov_deg, its "
+            f"the photograph of {width} x {height} is a strip; state projection=cylindrical and hfov_deg, its "
             "horizontal field of view (up to 360)"
         )
     return "perspective", "exif" if exif.focal is not None else "assumed"
@@ -207,7 +207,7 @@ def _action_camera(width: int, height: int, lens: Lens, exif: ExifLens, angle: f
     """Return the lens of an action camera by its maker and model."""
     text = (
         f"{exif.camera} has a fisheye lens of about {math.degrees(angle):.0f}° across the longer side, which is "
-        "assumed; for a linear mode send projection=perspective and hfov_deg"
+        "assumed; for a linear mode state projection=perspective and hfov_deg"
     )
     camera = camera_of_hfov("fisheye", width, height, angle * width / max(width, height))
     warnings = (*exif.warnings, text)

@@ -151,8 +151,8 @@ def _find_circles(thumbnail: Thumbnail) -> SphereFormat | None:
     beside = (part for part in (grey[:top], grey[:, :left]) if part.size)
     if all((part < _DARK).mean() > 0.9 for part in beside) and _is_circle(grey[top : top + side, left:][:, :side]):
         return SphereFormat(
-            text="the photograph is the circle of a fisheye lens: send projection=fisheye and hfov_deg, its horizontal "
-            "field of view (often 180), of the square around the circle"
+            text="the photograph is the circle of a fisheye lens: state projection=fisheye and hfov_deg, its "
+            "horizontal field of view (often 180), of the square around the circle"
         )
     return None
 

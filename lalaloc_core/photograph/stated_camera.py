@@ -91,7 +91,7 @@ class StatedCamera:
             raise InvalidPhotographError("hfov_deg and intrinsics exclude each other; send one of them")
         if self.projection not in (AUTO, "perspective", "fisheye"):
             raise InvalidPhotographError(
-                f"intrinsics do not apply to the projection '{self.projection}'; send hfov_deg"
+                f"intrinsics do not apply to the projection '{self.projection}'; state hfov_deg"
             )
         self._check_intrinsics(self.intrinsics)
 

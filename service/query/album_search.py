@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -61,11 +60,7 @@ class AlbumSearch:
         """Return what an album keeps of a photograph; raises the errors of decoding and encoding."""
         content, document, context = query.content, query.document, query.context
         with context.clock.stage("decode"):
-            try:
-                view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
-            except InvalidPhotographError as error:
-                raise InvalidPhotographError(_in_album(str(error))) from error
-            view = replace(view, warnings=tuple(map(_in_album, view.warnings)))
+            view = await self._parts.decoder.decode(content, document.stated_camera, context, purpose="album")
         if view.sphere is not None and not encodes_spheres(self._parts.bundle.manifest):
             raise InvalidPhotographError("the photograph is a full sphere, of which the model gives no features")
 
@@ -103,23 +98,20 @@ class AlbumSearch:
         return await self._threads.run(context.client, work)
 
     def _read(self, parts: Sequence[AlbumPart]) -> list[AlbumPhotograph]:
-        return [replace(read_entry(part.entry, self._parts.bundle), id=part.id, name=part.name or "") for part in parts]
+        return [replace(read_entry(part.entry, self._parts.bundle), name=part.name or "") for part in parts]
 
     def _solve(self, query: AlbumQuery, ground: Ground, photographs: Sequence[AlbumPhotograph]) -> AlbumOutcome:
         places = _album_ground(ground, query.document)
         dropped = dict[str, str]()
         stated = list[AlbumPhotograph]()
-        for entry, part in zip(photographs, query.photographs, strict=True):
-            if part.correction is None:
-                stated.append(entry)
-                continue
-            correction = read_correction(json.loads(part.correction))
-            if (fault := _misfit(places, correction.plan_id, correction.room_id)) is not None:
-                dropped[part.id] = fault
-                stated.append(entry)
-            else:
-                stated.append(replace(entry, correction=correction))
-        stored = {part.id: part.evidence for part in query.photographs if part.evidence is not None}
+        # Entries have the digests of the files, by which the same folder gets the same pins as on the command line.
+        parts = {entry.id: part for entry, part in zip(photographs, query.photographs, strict=True)}
+        for entry, part in zip(photographs, parts.values(), strict=True):
+            correction = None if part.correction is None else read_correction(json.loads(part.correction))
+            if correction and (fault := _misfit(places, correction.plan_id, correction.room_id)) is not None:
+                dropped[part.id], correction = fault, None
+            stated.append(replace(entry, correction=correction))
+        stored = {id: part.evidence for id, part in parts.items() if part.evidence is not None}
         memory = self._memories.pop(query.album_id) or AlbumMemory(stored=stored)
         begin_s, memory.spent_s = thread_time() - memory.spent_s, 0.0
 
@@ -130,7 +122,7 @@ class AlbumSearch:
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
             newest = next(reversed(memory.evidence))
-            query.progress.found[newest] = memory.to_bytes(newest)
+            query.progress.found[parts[newest].id] = memory.to_bytes(newest)
 
         def pause() -> None:
             # Others that wait for the core compute in between.
@@ -151,6 +143,8 @@ class AlbumSearch:
         finally:
             # The next attempt goes on from here.
             self._memories.put(query.album_id, memory)
+        pins = tuple(replace(pin, photograph_id=parts[pin.photograph_id].id) for pin in album.pins)
+        album = replace(album, pins=pins)
         before = {part.id: part.pin for part in query.photographs}
         return compose_outcome(
             album, ground, before, dropped, places.plan.camera_height_m, is_same_place=query.is_same_place
@@ -181,11 +175,6 @@ def _album_ground(ground: Ground, document: AlbumDocument) -> AlbumGround:
     ids = tuple(record.id for record in ground.records)
     merged = ground.merged or MergedPlans.of_plan(ground.plan, ground.grid)
     return AlbumGround(ids, replace(merged, plans=tuple(map(stated, merged.plans)), plan=stated(merged.plan)))
-
-
-def _in_album(text: str) -> str:
-    """Return an advice about a photograph for albums, whose camera is stated when they are created."""
-    return re.sub(r"\bsend (?=projection|hfov_deg|intrinsics)", "create an album with ", text)
 
 
 def _misfit(places: AlbumGround, plan_id: str | None, room_id: str | None) -> str | None:

@@ -55,9 +55,9 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     data_dir: Path = Field(
-        default=Path("data"), description="Data folder, with the SQLite database; created when missing."
+        default=Path("data"), description="Folder of the data and the SQLite database; in the image `/data`, a volume."
     )
-    bundle: Path = Field(default=_DEFAULT_BUNDLE, description="Folder of the model bundle.")
+    bundle: Path = Field(default=_DEFAULT_BUNDLE, description="Model bundle; in the image `/app/models/default`.")
     log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Minimum log level.")
     otlp_endpoint: str | None = Field(
         default=None,

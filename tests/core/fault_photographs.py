@@ -82,7 +82,7 @@ FAULTS = (
     Fault(name="crop_half.jpg", said="was cropped after it was taken", within_m=0.5, **_CORNER),
     Fault(name="crop_over_seam.jpg", room=None, said="(800, 100) is not within the full sphere of 1024 x 512"),
     Fault(name="cube_3x2.jpg", room=None, said="a cube map, 3 x 2 faces: convert it to equirectangular"),
-    Fault(name="cylinder_full_is_crop.jpg", room=None, said="the borders do not continue each other; send hfov_deg"),
+    Fault(name="cylinder_full_is_crop.jpg", room=None, said="the borders do not continue each other; state hfov_deg"),
     Fault(name="dual_fisheye.jpg", room=None, said="dual fisheye picture of a 360° camera"),
     Fault(name="film.jpg", room=None, said="is a video; send a film of a turn as a film"),
     Fault(name="front_camera.jpg", said="of a front camera (Exif LensModel 'iPhone 13 front camera 2.71mm f/2.2')"),

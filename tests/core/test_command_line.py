@@ -169,8 +169,8 @@ def test_many_photographs_give_a_table_places_on_earth_and_a_map(
 
 
 def test_warnings_are_told_once_by_cause(capsys: pytest.CaptureFixture[str]) -> None:
-    print_warnings([("a.jpg", "60° ± 8°"), ("a.jpg", "no lens"), ("b.jpg", "61.5° ± 9°"), ("b.jpg", "62° ± 9°")])
-    assert capsys.readouterr().err == "warning: a.jpg and 1 more: 60° ± 8°\nwarning: a.jpg: no lens\n"
+    print_warnings([("a.jpg", "60° ± 8°"), ("a.jpg", "state hfov_deg"), ("b.jpg", "61.5° ± 9°"), ("b.jpg", "62° ± 9°")])
+    assert capsys.readouterr().err == "warning: a.jpg and 1 more: 60° ± 8°\nwarning: a.jpg: state --hfov\n"
 
 
 @pytest.mark.parametrize(

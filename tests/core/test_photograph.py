@@ -75,7 +75,7 @@ class TestProjection:
             "noise": np.random.default_rng(0).integers(0, 256, (256, 512, 3)).astype(np.uint8),
         }
         for pixels in pictures.values():
-            with pytest.raises(InvalidPhotographError, match=r"not a full 360° sphere.*send hfov_deg"):
+            with pytest.raises(InvalidPhotographError, match=r"not a full 360° sphere.*state hfov_deg"):
                 opened(jpeg(np.ascontiguousarray(pixels)))
 
     def test_stated_field_of_view_and_projection_make_pictures_usable(self) -> None:
@@ -103,9 +103,9 @@ class TestProjection:
 
     def test_strip_asks_for_its_angle(self) -> None:
         strip = view_of(Around(width=1200, height=300, hfov=math.radians(240.0)))
-        with pytest.raises(InvalidPhotographError, match="is a strip; send projection=cylindrical and hfov_deg"):
+        with pytest.raises(InvalidPhotographError, match="is a strip; state projection=cylindrical and hfov_deg"):
             opened(jpeg(strip))
-        with pytest.raises(InvalidPhotographError, match="which angle the strip of 1200 x 300 shows; send hfov_deg"):
+        with pytest.raises(InvalidPhotographError, match="which angle the strip of 1200 x 300 shows; state hfov_deg"):
             opened(jpeg(strip, {Tag.CustomRendered: 6, Tag.FocalLengthIn35mmFilm: 26}))
         with pytest.raises(InvalidPhotographError, match="40000 x 64; one side can be 500 times as long as the other"):
             opened(picture_file(np.zeros((64, 40_000, 3), np.uint8)), hfov_deg=360.0)
@@ -124,7 +124,7 @@ class TestProjection:
             # The prior: most phones are within one standard deviation of their usual lens.
             assert math.degrees(view.hfov.value) == pytest.approx(67.0, abs=5.0)
             assert math.degrees(view.hfov.sd) > 8.0
-            assert re.search(r"° ± \d+° is only usual; send hfov_deg", view.warnings[-1])
+            assert re.search(r"° ± \d+° is only usual; state hfov_deg", view.warnings[-1])
 
     def test_damaged_exif_counts_as_missing(self) -> None:
         content = jpeg(np.full((96, 128, 3), 200, np.uint8), PHONE, orientation=6)
@@ -348,7 +348,7 @@ def test_fisheye_picture_that_is_read_in_perspective_has_bent_lines(field: float
     camera = Fisheye.of_hfov(1280, 960, math.radians(field))
     taken = jpeg(take(sphere("living_room"), camera))
     warnings = opened(taken, projection="perspective", hfov_deg=100.0).warnings
-    assert any("straight lines are bent by" in text and "send projection=fisheye" in text for text in warnings)
+    assert any("straight lines are bent by" in text and "state projection=fisheye" in text for text in warnings)
     stated = opened(taken, projection="fisheye", hfov_deg=field).warnings
     assert not any("bent" in text for text in stated)
 

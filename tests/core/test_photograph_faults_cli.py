@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from lalaloc_core.cli import main
+from lalaloc_core.cli.printing import with_options
 from tests.core.fault_photographs import FAULTS, FOLDER, LIBRARY_WORDS, Fault, fault_id
 from tests.core.taken import EXAMPLES
 
@@ -32,7 +33,7 @@ def test_files_are_localised_right_or_refused_by_name(capsys: pytest.CaptureFixt
             assert fault.said is None or f"warning: {FOLDER / fault.name}: " in errors
         else:
             fault.check_refusal(answer["error"])
-            assert f"error: {answer['error']}" in errors
+            assert f"error: {with_options(answer['error'])}" in errors
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault.fields], ids=fault_id)

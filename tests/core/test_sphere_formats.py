@@ -213,7 +213,7 @@ class TestParts:
         stated = {"ProjectionType": "cylindrical", "FullPanoWidthPixels": 1024, "CroppedAreaImageWidthPixels": 1024}
         whole, part = small("kitchen")[128:384], cv2.resize(small("kitchen")[128:384, :600], (1024, 400))
         assert opened(encoded(whole, "JPEG", xmp(**stated))).hfov.value == math.tau
-        with pytest.raises(InvalidPhotographError, match=r"borders do not continue each other; send hfov_deg"):
+        with pytest.raises(InvalidPhotographError, match=r"borders do not continue each other; state hfov_deg"):
             opened(encoded(part, "JPEG", xmp(**stated)))
 
 

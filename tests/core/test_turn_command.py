@@ -40,10 +40,12 @@ def test_folder_of_photographs_is_one_turn(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_warning_names_the_photographs_of_a_turn_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for index, frame in enumerate(turn()[:8:4]):
+    for index, frame in enumerate([*turn()[:8:4], turn()[24]]):
         (tmp_path / f"{index}.jpg").write_bytes(jpeg(frame))
     assert main(["localise", PLAN, "--turn", str(tmp_path)]) == 0
-    assert f"warning: {tmp_path / '0.jpg'} and 1 more: the field of view of" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"warning: {tmp_path / '0.jpg'} and 2 more: the field of view of" in told
+    assert "groups (0.jpg, 1.jpg; 2.jpg)" in told
     (tmp_path / "8.png").touch()
     assert main(["localise", PLAN, "--turn", str(tmp_path), "--out", f"{tmp_path}/8.png"]) == 2
     assert "8.png' is read and never changed" in capsys.readouterr().err

@@ -24,6 +24,7 @@ import pytest
 from PIL import ExifTags, Image
 from sqlalchemy import func, select, update
 
+from lalaloc_core import LaLaLoc
 from lalaloc_core.bundle import Bundle, default_bundle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.album import solve as album_solve
@@ -44,7 +45,8 @@ from service.storage.store import Store
 from service.storage.stored_bytes import ROW_BYTES
 from service.storage.tables import ALBUM_PHOTOGRAPHS, ALBUMS
 from service.telemetry import LOGGER_NAME
-from tests.core.taken import EXAMPLES
+from tests.core.filmed import turn
+from tests.core.taken import EXAMPLES, jpeg
 from tests.painted import picture_file
 from tests.service.conftest import FLAT, HOME, StartApp, assert_problem, document_of, lines_of, pages, upload, wait_for
 from tests.service.test_security import bearer, make_key
@@ -140,6 +142,18 @@ def test_photographs_get_pins_together(client: httpx.Client, solved: str, plan_i
         assert {place["room"] for place in row["pin"]["suggestions"]} <= rooms
 
 
+def test_pins_are_those_of_the_command_line(client: httpx.Client, plan_id: str, tmp_path: Path) -> None:
+    files = [jpeg(frame) for frame in turn()[::10]]
+    album_id = create(client, plan_id)
+    add(client, album_id, files)
+    wait_until_solved(client, album_id)
+    for number, content in enumerate(files):
+        (tmp_path / f"{number}.jpg").write_bytes(content)
+    pinned = LaLaLoc().pin(json.dumps(ANCHORED).encode(), tmp_path)
+    found = [row["pin"]["room_confidence"] for row in photographs(client, album_id)]
+    assert found == pytest.approx([present(each.pin).confidence for each in pinned.photographs], abs=1e-3)
+
+
 def test_pictures_are_added_once_and_unreadable_files_left_out(
     client: httpx.Client, plan_id: str, pictures: list[bytes]
 ) -> None:
@@ -148,7 +162,7 @@ def test_pictures_are_added_once_and_unreadable_files_left_out(
     unreadable, *first, empty = add(client, album_id, [strip, *pictures[:2], b""])
     assert [line["status"] for line in (unreadable, *first, empty)] == [422, 201, 201, 422]
     assert unreadable["problem"]["type"] == "urn:lalaloc:problem:invalid-photograph"
-    assert "create an album with projection=cylindrical and hfov_deg" in unreadable["problem"]["detail"]
+    assert "is a strip; state projection=cylindrical and hfov_deg" in unreadable["problem"]["detail"]
     assert (unreadable["name"], first[0]["photograph"]["name"]) == ("0.jpg", "1.jpg")
     again = add(client, album_id, [pictures[1], pictures[0], pictures[2], pictures[2]])
     assert [line["status"] for line in again] == [200, 200, 201, 200]

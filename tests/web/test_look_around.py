@@ -240,6 +240,7 @@ def test_link_for_the_phone_has_the_key_of_the_pages_link_only(desktop: Visit) -
     page.get_by_role("button", name="On a phone").click()
     assert page.locator("#phone-dialog a").get_attribute("href") == f"{lan}/#plan={plan_id}&key=lalaloc_run"
     expect(page.get_by_role("img", name="QR code")).to_be_visible()
+    expect(page.locator("#phone-dialog")).to_contain_text("warn once of the certificate")
     assert "secret" not in page.locator("#phone-dialog").inner_html()
     assert desktop.client.get("/").headers["Permissions-Policy"].startswith("camera=(self), microphone=()")
     _no_violations(page)

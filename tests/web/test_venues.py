@@ -51,6 +51,11 @@ def test_answer_of_a_venue_names_the_plan(browser: Browser, start_app: StartApp,
             page = visited.open()
             _choose_mill(page)
             page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+            page.locator("#hints summary").click()
+            # A mark needs the plan's place on Earth.
+            mark = page.locator("#hint-mark")
+            expect(mark).to_be_disabled()
+            expect(page.locator("#hint-unplaced")).to_be_visible()
             visited.find()
             _assert_accessible(page)
             plan_of = page.locator("#answer .plan-of")
@@ -75,6 +80,7 @@ def test_answer_of_a_venue_names_the_plan(browser: Browser, start_app: StartApp,
             page.get_by_role("button", name="Search only this plan").click()
             expect(page.locator("#venue-bar")).to_be_hidden()
             expect(page.locator("#answer")).to_be_hidden()
+            expect(mark).to_be_enabled()
             page.goto("about:blank")
             page.goto(link)
             expect(plan_of).to_contain_text(found)
@@ -120,22 +126,6 @@ def test_hints_about_a_venue_are_set_and_sent(browser: Browser, start_app: Start
             page.get_by_role("button", name="Search only this plan").click()
             expect(page.locator("#hints-summary")).to_be_empty()
             expect(page.get_by_label("Level", exact=True)).to_be_hidden()
-
-
-@pytest.mark.slow
-def test_mark_needs_the_place_of_the_plan_on_earth(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path) as client:
-        _make_mill(client)
-        for visited in visit(browser, client):
-            page = visited.open()
-            _choose_mill(page)
-            page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
-            page.locator("#hints summary").click()
-            expect(page.get_by_role("button", name="Mark the place on the plan")).to_be_disabled()
-            expect(page.locator("#hint-unplaced")).to_be_visible()
-            page.get_by_role("button", name="Search only this plan").click()
-            expect(page.get_by_role("button", name="Mark the place on the plan")).to_be_enabled()
-            expect(page.locator("#hint-unplaced")).to_be_hidden()
 
 
 @pytest.mark.slow

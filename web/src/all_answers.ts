@@ -17,10 +17,7 @@ export function showAll(photos: readonly Photo[], choose: (photo: Photo) => void
   const found = photos.flatMap((photo): Found[] => (photo.answer === null ? [] : [{ photo, answer: photo.answer }]));
   const panel = byId("all-answers");
   panel.hidden = found.length < 2;
-  if (panel.hidden) {
-    show(panel);
-    return;
-  }
+  if (panel.hidden) return show(panel);
   const heads = ["Photograph", "Room", "x, m", "y, m", "Heading", "Confidence"].map((head) =>
     h("th", { scope: "col" }, head),
   );

@@ -178,10 +178,7 @@ export class AnswerController {
     this.selected = index;
     this.moved = null;
     markSelected(index);
-    if (candidate.floorplan_id !== this.scene.plan?.id) {
-      void this.actions.showPlan(candidate.floorplan_id);
-      return;
-    }
+    if (candidate.floorplan_id !== this.scene.plan?.id) return void this.actions.showPlan(candidate.floorplan_id);
     const pose: Pose = { ...candidate.position, heading_deg: candidate.heading_deg };
     this.scene.marker.place(pose, this.scene.box);
     this.drawLines(pose);

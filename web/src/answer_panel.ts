@@ -40,10 +40,7 @@ export function showAnswer(answer: Answer | null, photo: Photo | null, actions: 
   panel.hidden = answer === null;
   // The answer is first on narrow screens.
   document.body.classList.toggle("answered", answer !== null);
-  if (answer === null) {
-    show(byId("answer-body"));
-    return;
-  }
+  if (answer === null) return show(byId("answer-body"));
   show(
     byId("answer-body"),
     summary(answer),

@@ -82,9 +82,8 @@ export class ImportForm {
    */
   ask(file: File, isNeeded: boolean, levels: string[] = [], factor: number | null = null): void {
     const isPicture = PICTURES.test(file.type);
-    if (isPicture && file !== this.file) {
+    if (isPicture && file !== this.file)
       void this.picture.open(file).catch((error: unknown) => showError(byId("plan-error"), error));
-    }
     this.file = file;
     const shown = [["units", "Unit"] as const, ...FIELDS]
       .filter(([name]) => !isPicture || OF_PICTURES.includes(name))

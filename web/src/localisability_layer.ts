@@ -87,10 +87,7 @@ export class LocalisabilityLayer {
   }
 
   private async toggle(): Promise<void> {
-    if (!this.panel.hidden) {
-      this.close();
-      return;
-    }
+    if (!this.panel.hidden) return this.close();
     if (this.running !== null) this.unfold();
     if (this.open.hasAttribute("aria-busy")) return;
     clearError(byId("plan-error"));
@@ -160,12 +157,7 @@ export class LocalisabilityLayer {
       isShown = !this.panel.hidden && found !== null && plan !== null;
     // The map of an answer would cover it.
     byId("plan-panel").classList.toggle("predicted", isShown);
-    if (!isShown) {
-      show(this.element);
-      show(this.share);
-      show(this.advice);
-      return;
-    }
+    if (!isShown) return [this.element, this.share, this.advice].forEach((part) => show(part));
     const heading = this.known.checked ? "known" : "unknown",
       condition = `${this.photograph.value}_${heading}_heading` as Condition;
     const within = Math.max(1, found.spacing_m);
@@ -181,8 +173,10 @@ export class LocalisabilityLayer {
       const cells = cellsOf(room, cell);
       return { ...cells, values: shadesOf(cells, found, found.rooms[index]!.id, condition) };
     });
-    const pictures = roomPictures("localisability", fields, () => OPACITY);
-    show(this.element, pictures);
+    show(
+      this.element,
+      roomPictures("localisability", fields, () => OPACITY),
+    );
   }
 }
 

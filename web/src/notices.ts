@@ -1,7 +1,7 @@
 /** Messages: errors next to the fields that cause them, and short notices. */
 
 import { ServiceError } from "./api";
-import { h, show } from "./dom";
+import { byId, h, show } from "./dom";
 import { InputError } from "./input_error";
 import { labelOf, plainWords } from "./plain_words";
 
@@ -43,7 +43,7 @@ export function showError(place: HTMLElement, error: unknown, fields: Fields = {
     detail = plainWords(failure?.detail ?? text);
   show(
     place,
-    title !== null && h("strong", {}, title),
+    title !== null && h("strong", {}, plainWords(title)),
     h("p", {}, plain ? `${plain} (${detail})` : detail),
     faults.length > 0 &&
       h(
@@ -99,8 +99,7 @@ let hide: number | undefined;
 
 /** Show a short notice at the bottom of the page. */
 export function say(text: string): void {
-  const place = document.getElementById("toast");
-  if (place === null) return;
+  const place = byId("toast");
   place.textContent = text;
   place.classList.add("shown");
   clearTimeout(hide);

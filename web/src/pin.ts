@@ -5,13 +5,13 @@ import { button, byId, download, h, named, s, show } from "./dom";
 import { acceptChoice, acceptDrops, isPicture } from "./drops";
 import { connectKeyDialog } from "./key_dialog";
 import { attempt, connectNumbers, InputError, say } from "./notices";
-import { type CardActions, cardOf, markCurrent, movedOf, sureOf } from "./pin_card";
+import { type CardActions, cardOf, markCurrent, movedOf, sureOf, warningsOf } from "./pin_card";
 import { type Drawn, drawn, keep } from "./pin_drawn";
 import { Floors, folderOption, listPlaces, type Row } from "./pin_floors";
 import { fanned, type PinActions, pinOf } from "./pin_map";
 import { added, photographsOf, saveCopies, type Thumbnail, thumbnailOf, wantedOf } from "./pin_photographs";
 import { showPages } from "./pin_print";
-import { plainWords } from "./plain_words";
+import { folderWords, plainWords } from "./plain_words";
 import { boxOf, drawNames, drawPlan, lostAreas, unitOf } from "./plan_drawing";
 import type { Plan } from "./types";
 import type { Schemas } from "../../clients/typescript/src/index";
@@ -216,7 +216,7 @@ class PinPage {
     try {
       for await (const { file, line } of added(album.id, wanted)) {
         if (typeof line === "string") tell(`${file.name}: ${line}`);
-        else if (!line.photograph) tell(`${file.name}: ${plainWords(line.problem?.detail ?? "not added")}`);
+        else if (!line.photograph) tell(`${file.name}: ${folderWords(line.problem?.detail ?? "not added")}`);
         else {
           if (line.status === 200) copies++;
           // Features have no width: the service cannot tell whose they are.
@@ -324,8 +324,8 @@ class PinPage {
     const moved = this.rows.map(movedOf).filter((text) => text !== null);
     byId("moved").hidden = moved.length === 0;
     show(byId("moved-list"), ...moved.map((text) => h("li", {}, text)));
-    const warnings = this.album?.solution?.warnings ?? [];
-    show(byId("album-warnings"), ...warnings.map((text) => h("li", {}, plainWords(text))));
+    const warnings = [...(this.album?.solution?.warnings ?? []).map(plainWords), ...warningsOf(this.rows)];
+    show(byId("album-warnings"), ...warnings.map((text) => h("li", {}, text)));
     byId("keys").hidden = this.rows.length === 0;
     this.drawExports();
   }

@@ -5,7 +5,7 @@ import { button, h, s } from "./dom";
 import { degrees, layoutLines, radians } from "./layout";
 import type { Floors, PinnedAt, Row } from "./pin_floors";
 import type { Thumbnail } from "./pin_photographs";
-import { percent, plainWords } from "./plain_words";
+import { folderWords, percent } from "./plain_words";
 import { equirectangular } from "./projection";
 import type { Point } from "./types";
 
@@ -129,10 +129,6 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
       h("strong", { class: "name" }, `${row.number} ${row.name ?? ""}`),
       h("p", {}, factsOf(row)),
       h("p", { class: "hint" }, row.view.taken_at?.replace("T", " ").slice(0, 16)),
-      // Photographs of a folder have no fields.
-      ...(pin?.warnings ?? []).map((text) =>
-        h("p", { class: "hint" }, plainWords(text).replace("“Field of view” or ", "")),
-      ),
     ),
     others,
     h(
@@ -145,6 +141,19 @@ export function cardOf(row: Row, picture: Thumbnail | null, floors: Floors, heig
   );
   card.addEventListener("focusin", () => act.show(row));
   return h("li", { class: pin?.state ?? "waiting" }, card);
+}
+
+/** Return the warnings about photographs, each cause once: its texts differ in numbers only. */
+export function warningsOf(rows: Row[]): string[] {
+  const causes = new Map<string, { named: string; text: string; more: number }>();
+  for (const { number, name, pin } of rows)
+    for (const text of (pin?.warnings ?? []).map(folderWords)) {
+      const cause = text.replace(/\d+(\.\d+)?/g, "#"),
+        known = causes.get(cause);
+      if (known === undefined) causes.set(cause, { named: `${number} ${name ?? ""}`, text, more: 0 });
+      else known.more++;
+    }
+  return [...causes.values()].map(({ named, text, more }) => `${named}${more > 0 ? ` and ${more} more` : ""}: ${text}`);
 }
 
 /** Mark the pin and the card of a photograph, by its number, as the current ones. */

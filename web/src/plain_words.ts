@@ -50,6 +50,8 @@ export const percent = (share: number): string =>
 export function plainWords(message: string): string {
   return message
     .replace(/[;,] see docs\/\S+$/, "")
+    .replace(/(?<!\/)\balbum(?=s?\b)/g, "folder")
+    .replace(/photo\[(\d+)\]/g, (_, index: string) => `photo ${Number(index) + 1}`)
     .replace(/\b(\d+)\d{5} bytes/g, (_, tenths: string) => `${Number(tenths) / 10} MB`)
     .replace(/ \((?:LALALOC_[A-Z_]+|([a-z]+(?:_[a-z]+)+))\)/g, (whole, name: string) => (name in LABELS ? whole : ""))
     .replace(/\b([a-z]+)=(\w+(?:[.,:]\d+)*)/g, (whole, field: string, value: string) =>
@@ -60,3 +62,7 @@ export function plainWords(message: string): string {
     )
     .replace(/`([a-z]+)`/g, (whole, field: string) => (field in LABELS ? `“${labelOf(field)}”` : whole));
 }
+
+/** Return a message in the words of the page of folders, which has no fields for photographs. */
+export const folderWords = (message: string): string =>
+  plainWords(message).replace("state “Field of view”, or ", "").replace("state “", "on the start page state “");

@@ -18,9 +18,8 @@ export function showCaption(plan: Plan | null, example: PlanDocument | null = nu
   byId("preparing").hidden = plan?.status !== "preparing";
   byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
   byId<HTMLButtonElement>("edit-plan").disabled = plan === null;
-  if (plan?.status === "failed") {
+  if (plan?.status === "failed")
     showError(byId("plan-error"), new InputError(`The plan could not be prepared: ${plan.reason}`));
-  }
   showWarnings(plan);
 }
 

@@ -144,11 +144,11 @@ function north(plan: PlanDocument, box: Box): SVGGElement | null {
   const unit = unitOf(box);
   return s(
     "g",
-    { class: "north", transform: `translate(${box.x + box.width - 4 * unit} ${box.y + box.height - 4 * unit})` },
+    { class: "north", transform: `translate(${box.x + box.width - 2.4 * unit} ${box.y + box.height - 3.6 * unit})` },
     s("path", {
-      d: `M0 ${-3 * unit}L${unit} ${unit}L0 ${0.4 * unit}L${-unit} ${unit}Z`,
+      d: `M0 ${-2 * unit}L${0.8 * unit} ${unit}L0 ${0.4 * unit}L${-0.8 * unit} ${unit}Z`,
       transform: `rotate(${plan.north_deg})`,
     }),
-    s("text", { y: 3 * unit, "font-size": 1.8 * unit }, "N"),
+    s("text", { y: 2.8 * unit, "font-size": 1.8 * unit }, "N"),
   );
 }

@@ -159,8 +159,7 @@ export class LiveSession {
 
   private describe({ mode, pose, photographs, id }: Session): void {
     const others = (pose?.candidates ?? []).slice(1).filter(({ probability }) => probability >= MIN_SHARE);
-    const level = (at: { level?: number | null }): string =>
-      at.level === null || at.level === undefined ? "" : `, level ${at.level}`;
+    const level = (at: { level?: number | null }): string => (at.level == null ? "" : `, level ${at.level}`);
     const possible = others.map((at) => `${at.room}${level(at)} (${percent(at.probability)})`);
     show(
       this.state,
@@ -185,10 +184,7 @@ export class LiveSession {
     const { id, box } = this.plan,
       unit = unitOf(box),
       pose = session?.pose ?? null;
-    if (session === null || pose === null || id === undefined) {
-      show(this.layer);
-      return;
-    }
+    if (session === null || pose === null || id === undefined) return show(this.layer);
     const isHere = (at: { floorplan_id?: string | null }): boolean => (at.floorplan_id ?? session.floorplan_id) === id;
     const path = session.path.filter(isHere).map(({ position }) => position);
     const { x_m, y_m } = pose.position;

@@ -73,9 +73,8 @@ export function findLens(size: Size, stated: Stated, metadata: Metadata, isSpher
   }
   if (hfovDeg !== null) {
     const [low, high] = HFOV_DEG[projection];
-    if (!(hfovDeg >= low && hfovDeg <= high)) {
+    if (!(hfovDeg >= low && hfovDeg <= high))
       throw new InputError(`“Field of view” is ${hfovDeg}°; it must be between ${low}° and ${high}°.`);
-    }
     return lens(radians(hfovDeg), "given", GIVEN_SD);
   }
   if (projection === "cylindrical") {

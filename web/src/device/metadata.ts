@@ -40,9 +40,8 @@ function jpegParts(view: DataView, found: Metadata): void {
     if (marker === 0xda) return;
     if (marker === 0xe1 && ascii(view, begin, EXIF_HEAD.length) === EXIF_HEAD)
       readTiff(view, begin + EXIF_HEAD.length, found);
-    else if (marker === 0xe1 && ascii(view, begin, Math.min(XMP_HEAD.length, length - 2)) === XMP_HEAD) {
+    else if (marker === 0xe1 && ascii(view, begin, Math.min(XMP_HEAD.length, length - 2)) === XMP_HEAD)
       readXmp(text(view, begin + XMP_HEAD.length, at + 2 + length), found);
-    }
     at += 2 + length;
   }
 }

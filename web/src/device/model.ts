@@ -58,9 +58,8 @@ export class Model {
 
   get patchSize(): PatchSize {
     const { view, ring_sectors: sectors, profile_columns: columns } = this.manifest;
-    if (view === null || sectors === null) {
+    if (view === null || sectors === null)
       throw new InputError(`The service’s model “${this.manifest.name}” gives features of full 360° photographs only.`);
-    }
     const hfov = (2 * Math.PI * view.sectors) / sectors;
     return {
       width: view.image_width,

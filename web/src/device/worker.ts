@@ -189,7 +189,7 @@ function withLines(bitmap: ImageBitmap, lens: Lens): { lens: Lens & { hfov: numb
     spread = 2 * found.focalSd * Math.sin(found.hfov);
   const warning =
     `the field of view of ${degrees(found.hfov).toFixed(0)}° ± ${degrees(spread).toFixed(0)}° ` +
-    `${segments.length > 0 ? "was estimated from straight lines" : "is only usual"}; send hfov_deg, or send the camera's original file`;
+    `${segments.length > 0 ? "was estimated from straight lines" : "is only usual"}; state hfov_deg, or send the camera's original file`;
   return {
     lens: { ...lens, hfov: found.hfov, focalSd: found.focalSd, warnings: [...lens.warnings, warning] },
     lined: linedBy(found.attitude),

@@ -109,9 +109,8 @@ export function addRoom(plan: PlanDocument, polygon: Point[]): PlanDocument {
   return { ...plan, rooms: [...plan.rooms, room] };
 }
 
-export function changeRoom(plan: PlanDocument, index: number, change: Partial<RoomDocument>): PlanDocument {
-  return withRoom(plan, index, (room) => ({ ...room, ...change }));
-}
+export const changeRoom = (plan: PlanDocument, index: number, change: Partial<RoomDocument>): PlanDocument =>
+  withRoom(plan, index, (room) => ({ ...room, ...change }));
 
 /** Give all rooms the ceiling height of the plan. */
 export function withOneCeiling(plan: PlanDocument): PlanDocument {

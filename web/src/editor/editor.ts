@@ -129,6 +129,8 @@ export class Editor {
 
   /** Take a changed plan; return false, and say why, if it is refused. */
   private edit(plan: PlanDocument, goesOn = false, selection = this.selection): boolean {
+    // Moved to where it was: nothing to undo.
+    if (!goesOn && JSON.stringify(plan) === JSON.stringify(this.history?.now)) return false;
     const overlap = this.history && change.overlapIn(plan, this.history.now);
     if (overlap === null) this.put(plan, goesOn, selection);
     else {
@@ -155,7 +157,8 @@ export class Editor {
   private close(stored: Plan | null): void {
     if (stored !== null && this.history !== null) {
       const types = change.typesByName(this.history.now, stored.plan);
-      say(`“${stored.name}” is stored, revision ${stored.revision_number}.${types}`);
+      const picture = this.underlay.traced && " The picture below it stays until this page is closed.";
+      say(`“${stored.name}” is stored, revision ${stored.revision_number}.${types}${picture ?? ""}`);
       this.traced.keep(stored.id, this.underlay.traced);
     }
     this.history = null;
@@ -279,10 +282,8 @@ export class Editor {
   }
 
   private applyScale(distance: number): void {
-    if (this.history === null || !(distance > 0) || !(this.measured > 0)) {
-      showError(this.error, new InputError("The distance must be more than 0 m, between two different points."));
-      return;
-    }
+    if (this.history === null || !(distance > 0) || !(this.measured > 0))
+      return showError(this.error, new InputError("The distance must be more than 0 m, between two different points."));
     clearError(this.error);
     const factor = distance / this.measured,
       { viewport } = this.scene,
@@ -311,11 +312,15 @@ export class Editor {
 
   private async attempt(store: (base: Plan) => Promise<void>): Promise<void> {
     clearError(this.error);
+    // A second click would store the plan again.
+    this.bar.inert = true;
     try {
       await store(this.base!);
     } catch (error) {
       showError(this.error, error);
       if (error instanceof ServiceError && error.status === 412) this.offerResolutions();
+    } finally {
+      this.bar.inert = false;
     }
   }
 
@@ -338,10 +343,7 @@ export class Editor {
   private async loadTheirs(isShown: boolean): Promise<void> {
     await this.attempt(async (base) => {
       this.base = await api.plan(base.id);
-      if (!isShown) {
-        this.close(await api.replacePlan(base.id, this.history!.now, this.base.etag));
-        return;
-      }
+      if (!isShown) return this.close(await api.replacePlan(base.id, this.history!.now, this.base.etag));
       // One more step of the history, so that undo returns to the user's version.
       this.put(this.base.plan, false, { kind: "none" });
       this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” returns to your version; saving makes it the latest.`;
@@ -366,10 +368,8 @@ export class Editor {
   }
 
   private onKey(event: KeyboardEvent): void {
-    if (this.history !== null && event.key === "Escape" && this.tools.current === "select") {
-      this.select({ kind: "none" });
-      return;
-    }
+    if (this.history !== null && event.key === "Escape" && this.tools.current === "select")
+      return this.select({ kind: "none" });
     if (this.history === null || event.target instanceof HTMLInputElement || !(event.ctrlKey || event.metaKey)) return;
     const key = event.key.toLowerCase();
     if (key === "z") this.step(event.shiftKey ? "redo" : "undo");

@@ -36,18 +36,24 @@ const PLACES = "latitude, longitude of x 0, y 0, or x, y, latitude, longitude of
 const MAX_NAMED = 6;
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
+let later: number | undefined;
+
 export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: EditActions): void {
-  if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
-    // The form already shows the typed text.
-    if (place.dataset.of === JSON.stringify(selection)) return;
-  }
-  place.dataset.of = JSON.stringify(selection);
-  const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
-  const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
-  if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
-  else if (opening !== undefined && selection.kind === "opening")
-    show(place, ...openingForm(opening, selection.index, actions));
-  else show(place, ...planForm(plan, actions));
+  const draw = (): void => {
+    const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
+    const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
+    if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
+    else if (opening !== undefined && selection.kind === "opening")
+      show(place, ...openingForm(opening, selection.index, actions));
+    else show(place, ...planForm(plan, actions));
+  };
+  const isTyping = (): boolean => place.contains(document.activeElement?.closest("input, select") ?? null),
+    of = JSON.stringify(selection);
+  clearTimeout(later);
+  if (place.dataset.of !== of || !place.hasChildNodes()) draw();
+  // A field that is left changes the plan before the next one has the focus; that shows what is typed.
+  else later = window.setTimeout(() => place.hasChildNodes() && !isTyping() && draw());
+  place.dataset.of = of;
 }
 
 let current: PlanDocument = { rooms: [] };
@@ -138,9 +144,11 @@ function roomForm(room: RoomDocument, index: number, { edit, select }: EditActio
   const hint = current.ceiling_height_m == null ? ASSUMED : `${current.ceiling_height_m} of the plan`;
   return [
     h("h3", {}, "Room"),
-    text("room-form-name", "Name", room.name ?? "", (name) =>
-      set({ name, types: room.types?.length ? room.types : undefined }),
-    ),
+    text("room-form-name", "Name", room.name ?? "", (name) => {
+      const { type, types } = current.rooms[index]!;
+      set({ name, types: types?.length ? types : undefined });
+      if ((type ?? "unknown") !== "unknown") say(`The type stays ${type}; “unknown” takes it from the name.`);
+    }),
     choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) =>
       set({ type, types: type === "unknown" ? [] : undefined }),
     ),

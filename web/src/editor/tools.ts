@@ -119,10 +119,8 @@ export class Tools {
 
   private putOpening(kind: OpeningKind, place: Point): void {
     const nearest = change.nearestWall(this.plan, place);
-    if (nearest === null || nearest.distance > Math.max(MAX_OFFSET_UNITS * this.unit, change.NEAR_WALL_M)) {
-      this.actions.instruct(`No wall is close enough. ${HINTS[kind]}`);
-      return;
-    }
+    if (nearest === null || nearest.distance > Math.max(MAX_OFFSET_UNITS * this.unit, change.NEAR_WALL_M))
+      return this.actions.instruct(`No wall is close enough. ${HINTS[kind]}`);
     if (this.actions.edit(change.addOpening(this.plan, kind, nearest.wall, place))) this.choose("select");
   }
 

@@ -85,8 +85,7 @@ export class LookAround {
       this.video.srcObject = this.stream;
       await this.video.play();
     } catch (error) {
-      this.offerFilm(reasonOf(error));
-      return;
+      return this.offerFilm(reasonOf(error));
     }
     await sensors;
     this.sensors.hidden = !this.orientation.isDenied;

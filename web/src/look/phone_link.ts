@@ -44,9 +44,11 @@ export class PhoneLink {
     this.code.hidden = this.link.hidden = /^(localhost|127\..*|0\.0\.0\.0|\[::1?\])$/.test(location.hostname);
     this.warning.textContent = this.link.hidden
       ? "Phones cannot reach this address: run `make serve-lan` (`lalaloc-service serve --lan`) and open its link."
-      : location.protocol === "https:"
-        ? "The phone asks for an API key if the service needs one and the link has none."
-        : "Without HTTPS, phones do not allow the camera; a film can be chosen instead.";
+      : key.inLinks() !== ""
+        ? "Phones warn once of the certificate: choose Advanced and Proceed, on an iPhone Show Details and visit this website. The link has a key, which ends with this run of the service."
+        : location.protocol === "https:"
+          ? "The phone asks for an API key if the service needs one."
+          : "Without HTTPS, phones do not allow the camera; a film can be chosen instead.";
     this.dialog.showModal();
   }
 }
