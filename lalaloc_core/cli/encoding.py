@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,7 +57,12 @@ def _encode(arguments: argparse.Namespace) -> None:
     check_sources(arguments)
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
-    check_free((path.with_suffix(".features") for path in arguments.photographs), arguments.photographs)
+    written = [path.with_suffix(".features") for path in arguments.photographs]
+    check_free(written, arguments.photographs)
+    if doubles := [name for name, count in Counter(written).items() if count > 1]:
+        raise InvalidInputError(
+            f"several photographs would be written to '{doubles[0]}'; encode them one by one, with --out"
+        )
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
     if arguments.turn is not None:
