@@ -18,7 +18,7 @@ from service.errors import InvalidRequestError, UnknownFloorPlanError, UnknownRe
 from service.http import IdempotentRequest
 from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
-from service.http.middleware.admission import reading
+from service.http.middleware.admission import away, reading
 from service.http.representations import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
@@ -173,7 +173,8 @@ class ApiCall:
 
     async def rendition(self, plan: PlanSummary | PlanRecord, kind: RenditionKind) -> Rendition:
         """Return a file made from a stored plan; see `RenditionCache.get`."""
-        return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
+        async with away(self.request.scope):
+            return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
 
     def venue(self, venue_id: str) -> VenueRecord:
         """Return a stored venue. Blocks."""

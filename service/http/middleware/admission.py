@@ -19,7 +19,7 @@ from service.errors import DeadlineExceededError, OverloadedError, StoppingError
 from service.http.problems import problem_answer
 from service.http.uploads import ending_request
 from service.security.access_control import routed_path
-from service.security.permissions import caller_of
+from service.security.permissions import OPEN_PATHS, caller_of
 
 # Bytes of a query's body that arrive without a rest, and the time (s) that the server takes to receive a byte.
 _FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9
@@ -65,6 +65,9 @@ class AdmissionMiddleware:
 
     def _class_of(self, scope: Scope) -> RouteClass:
         method, path = scope["method"], routed_path(scope)
+        if path in OPEN_PATHS:
+            # Nobody is known to be the caller of any method.
+            return PROBE
         for route, declared in self._declared:
             if method in (route.methods or ()) and route.path_regex.match(path):
                 return declared
@@ -105,6 +108,12 @@ def reading(scope: Scope) -> AbstractAsyncContextManager[None]:
     """Return a block in which a request holds a permit to read, for answers that are read part by part."""
     permit: _ReadPermit = scope[_SCOPE_KEY]
     return permit.for_a_part()
+
+
+def away(scope: Scope) -> AbstractAsyncContextManager[None]:
+    """Return a block in which a request waits for a worker, and others of its client hold the permit to read."""
+    permit: _ReadPermit = scope[_SCOPE_KEY]
+    return permit.away()
 
 
 class _Rests:
@@ -173,6 +182,16 @@ class _ReadPermit:
             return
         async with self._semaphore.held(self._client):
             yield
+
+    @asynccontextmanager
+    async def away(self) -> AsyncIterator[None]:
+        """Give the permit back, and take it again after the block, if the request holds it."""
+        was_held = self._is_held
+        self.end()
+        yield
+        if was_held:
+            await self._semaphore.acquire(self._client)
+            self._is_held = True
 
     def end(self) -> None:
         """Give the permit back, once."""
