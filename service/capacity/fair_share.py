@@ -194,6 +194,13 @@ class FairSemaphore:
         finally:
             self.release(client)
 
+    def give_way(self, client: str) -> None:
+        """Release a permit to waiting clients with less CPU time lately, if any, and wait for it anew, on a thread."""
+        # Queued before the release, which others get otherwise whatever they used.
+        permit = self._queued(client)
+        self.release(client)
+        permit.result()
+
     def release(self, client: str) -> None:
         """Release a permit."""
         with self._lock:
