@@ -145,8 +145,13 @@ class ApiCall:
         return await self.runtime.reads.run(self.tenant, work, *args, **kwargs)
 
     async def process(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run work on what was read, on the same threads; see `BoundedReads.process`."""
-        return await self.runtime.reads.process(self.tenant, work, *args, **kwargs)
+        """Run work on what was read, on the same threads, after which the client rests; see `BoundedReads.process`."""
+
+        def charged() -> T:
+            with self.runtime.telemetry.cpu_accounts.charged(self.client, rests=True):
+                return work(*args, **kwargs)
+
+        return await self.runtime.reads.process(self.tenant, charged)
 
     def reading(self) -> AbstractAsyncContextManager[None]:
         """Return a block that holds a permit to read, for answers that are read part by part."""
