@@ -30,7 +30,7 @@ from lalaloc_core.importers import EXPORT_FORMATS, ImportLimits, export_plan
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
 PLANS = {VERTICES_PLAN: (500, 190), ROOMS_PLAN: (10_000, 4, 2)}
 # Photographs of a sequence and of a batch.
-_PHOTOGRAPHS = 10
+_PHOTOGRAPHS, _VIEWS = 10, 4
 _ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}
 
 
@@ -144,6 +144,11 @@ def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:
 @cache
 def _sphere() -> bytes:
     return read_poses()[0].picture.read_bytes()
+
+
+@cache
+def _view(number: int) -> bytes:
+    return (ROOT / f"examples/turn_{number + 1}.jpg").read_bytes()
 
 
 def _spheres(*fields: tuple[str, str], first: int = 0) -> tuple[bytes, str]:
@@ -297,11 +302,13 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **field
     return work
 
 
-def _sequence(*, padded: bool, venue: bool = False, photographs: int = _PHOTOGRAPHS) -> Work:
-    """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
+def _sequence(*, venue: bool = False, views: bool = False) -> Work:
+    """Return the work of a sequence of spheres of `size` tenths of a megabyte in total, or of `size` views of a turn."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
-        files = photographs * (("photo", _padded_picture(size * 10**5 // photographs if padded else 0)),)
+        files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS)),)
+        if views:
+            files = tuple(("photo", _view(number % _VIEWS)) for number in range(size))
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
         caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 
@@ -510,10 +517,10 @@ LOADS = (
         refusals=_TOO_LONG,
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
-    _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
-    _sequencing("18 photographs of a turn", _sequence(padded=False, photographs=18), connections=4),
-    _sequencing("10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
-    _sequencing("10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44),
+    _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence()),
+    _sequencing("40 photographs of a phone's turn", _sequence(views=True), 40, connections=4),
+    _sequencing("10 photographs, {homes} homes", _sequence(venue=True)),
+    _sequencing("10 photographs of 100 MB in total", _sequence(), 1_000, connections=44),
     Load(
         (*_SESSIONS, f"GET {_SESSION}", f"DELETE {_SESSION}"),
         f"two photographs, {ROOMS_PLAN}",
