@@ -303,7 +303,7 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **field
 
 
 def _sequence(*, venue: bool = False, views: bool = False) -> Work:
-    """Return the work of a sequence of spheres of `size` tenths of a megabyte in total, or of `size` views of a turn."""
+    """Return the work of a sequence of spheres, `size` tenths of a megabyte in total, or of `size` views of a turn."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
         files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS)),)
