@@ -518,7 +518,7 @@ LOADS = (
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
     _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence()),
-    _sequencing("40 photographs of a phone's turn", _sequence(views=True), 40, connections=4),
+    _sequencing("18 photographs of a phone's turn", _sequence(views=True), 18, connections=4),
     _sequencing("10 photographs, {homes} homes", _sequence(venue=True)),
     _sequencing("10 photographs of 100 MB in total", _sequence(), 1_000, connections=44),
     Load(
