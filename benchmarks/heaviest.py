@@ -30,7 +30,7 @@ from lalaloc_core.importers import EXPORT_FORMATS, ImportLimits, export_plan
 VERTICES_PLAN, ROOMS_PLAN = "500 rooms × 190 walls", "10,000 rooms × 20,000 openings"
 PLANS = {VERTICES_PLAN: (500, 190), ROOMS_PLAN: (10_000, 4, 2)}
 # Photographs of a sequence and of a batch.
-_PHOTOGRAPHS, _VIEWS = 10, 4
+_PHOTOGRAPHS = 10
 _ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "north_deg": 25.0}
 
 
@@ -144,11 +144,6 @@ def _venue(plan_ids: Sequence[str], name: str = "venue") -> bytes:
 @cache
 def _sphere() -> bytes:
     return read_poses()[0].picture.read_bytes()
-
-
-@cache
-def _view(number: int) -> bytes:
-    return (ROOT / f"examples/turn_{number + 1}.jpg").read_bytes()
 
 
 def _spheres(*fields: tuple[str, str], first: int = 0) -> tuple[bytes, str]:
@@ -308,7 +303,8 @@ def _sequence(*, venue: bool = False, views: bool = False) -> Work:
     def work(caller: Caller, stored: Stored, size: int) -> None:
         files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS)),)
         if views:
-            files = tuple(("photo", _view(number % _VIEWS)) for number in range(size))
+            pictures = [(ROOT / f"examples/turn_{number}.jpg").read_bytes() for number in range(1, 5)]
+            files = tuple(("photo", pictures[number % len(pictures)]) for number in range(size))
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
         caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 

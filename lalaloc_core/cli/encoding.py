@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,10 +58,9 @@ def _encode(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
     written = [path.with_suffix(".features") for path in arguments.photographs]
     check_free(written, arguments.photographs)
-    if doubles := [name for name, count in Counter(written).items() if count > 1]:
-        raise InvalidInputError(
-            f"several photographs would be written to '{doubles[0]}'; encode them one by one, with --out"
-        )
+    if len({*written}) < len(written):
+        double = max(written, key=written.count)
+        raise InvalidInputError(f"'{double}' would be written twice; encode the photographs one by one, with --out")
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
     if arguments.turn is not None:

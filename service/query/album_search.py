@@ -123,9 +123,7 @@ class AlbumSearch:
                 stated.append(replace(entry, correction=correction))
         stored = {part.id: part.evidence for part in query.photographs if part.evidence is not None}
         memory = self._memories.pop(query.album_id) or AlbumMemory(stored=stored)
-        begin_s, memory.spent_s = thread_time() - memory.spent_s, 0.0
-
-        client = query.context.client
+        begin_s, memory.spent_s, client = thread_time() - memory.spent_s, 0.0, query.context.client
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)

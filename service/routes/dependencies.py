@@ -18,7 +18,7 @@ from service.errors import InvalidRequestError, UnknownFloorPlanError, UnknownRe
 from service.http import IdempotentRequest
 from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
-from service.http.middleware.admission import away, reading
+from service.http.middleware.admission import read_permit
 from service.http.representations import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
@@ -155,7 +155,7 @@ class ApiCall:
 
     def reading(self) -> AbstractAsyncContextManager[None]:
         """Return a block that holds a permit to read, for answers that are read part by part."""
-        return reading(self.request.scope)
+        return read_permit(self.request.scope).for_a_part()
 
     def plan(self, floorplan_id: str) -> PlanSummary:
         """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks."""
@@ -178,7 +178,7 @@ class ApiCall:
 
     async def rendition(self, plan: PlanSummary | PlanRecord, kind: RenditionKind) -> Rendition:
         """Return a file made from a stored plan; see `RenditionCache.get`."""
-        async with away(self.request.scope):
+        async with read_permit(self.request.scope).away():
             return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
 
     def venue(self, venue_id: str) -> VenueRecord:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from functools import partial
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid
-from lalaloc_core.localise.match.pose_grid import Layouts
 from lalaloc_core.localise.query import CameraHeight, Candidate, Query
 from lalaloc_core.localise.search import turn_search
 from lalaloc_core.localise.search.pipeline import localise, run_steps
@@ -102,22 +100,17 @@ def test_unknown_relative_headings_are_found_in_few_places(
 def test_headings_beside_a_sphere_are_searched_near_its_place(
     search: partial[SearchedTurn], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compared, costs, headings = [0], MatchingCost.costs, [0.3, 1.5, 4.0] * 6
-
-    def counted(self: MatchingCost, layouts: Layouts, *rest: Any) -> Any:
-        compared.append(len(layouts))
-        return costs(self, layouts, *rest)
-
+    headings, costs, compared = [0.3, 1.5, 4.0] * 6, MatchingCost.costs, list[int]()
+    counted = lambda *given: compared.append(len(given[1])) or costs(*given)  # noqa: E731
     monkeypatch.setattr(MatchingCost, "costs", counted)
-    found = search(
-        headings, [RelativeHeading(index, 0.0, 0.0) for index in range(18)], Candidate(*SPOT_M, ROOM, *[0] * 4)
-    )
+    unknown = [RelativeHeading(index, 0.0, 0.0) for index in range(18)]
+    found = search(headings, unknown, Candidate(*SPOT_M, ROOM, *[0] * 4))
     assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
     assert max(compared) <= turn_search._NEAR
     # Few photographs choose the places of many.
     monkeypatch.setattr(turn_search, "_MAX_PLACES", 8)
     compared.clear()
-    search(headings, [RelativeHeading(index, 0.0, 0.0) for index in range(18)])
+    search(headings, unknown)
     assert sum(count > 8 for count in compared) == turn_search._MAX_CHOOSING
 
 

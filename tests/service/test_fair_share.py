@@ -314,12 +314,11 @@ def test_call_gives_way_only_to_clients_that_used_less() -> None:
                     charge_until_now()
                     turns.give_way(client)
                 ended.set()
-                return steps["a"]
+            return steps["a"]
 
         large = asyncio.create_task(threads.run("a", compute, "a", 0.05))
-        while steps["a"] < 3:
+        while (before := steps["a"]) < 3:
             await asyncio.sleep(0.01)
-        before = steps["a"]
         try:
             return await threads.run("b", compute, "b", 0.001) - before
         finally:

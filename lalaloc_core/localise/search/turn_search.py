@@ -101,10 +101,7 @@ def searched_turn(
     matching: MatchingConfig,
     place: Candidate | None = None,
 ) -> Generator[None, Any, SearchedTurn]:
-    """Search the relative headings of photographs of one spot, near its place if that is known; yields None in pauses.
-
-    The work is bounded: it grows with the number of photographs only near a known place.
-    """
+    """Search relative headings of photographs of one spot, near their place if it is known; yields None in pauses."""
 
     def log_likelihood(query: Query, index: np.ndarray, stride: int = 1) -> Float[np.ndarray, "p k"]:
         """Return the log likelihood of some poses under each hypothesis, by every so many azimuths."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from typing import Any, cast
 
 from starlette.datastructures import Headers
@@ -77,7 +77,7 @@ class AdmissionMiddleware:
         self, admission: Admission, route_class: RouteClass, client: str, scope: Scope, receive: Receive, send: Send
     ) -> None:
         rests = _Rests(admission.cpu_accounts, client, query=route_class.is_query)
-        permit = scope[_SCOPE_KEY] = _ReadPermit(admission.reading, client, rests)
+        permit = scope[_SCOPE_KEY] = ReadPermit(admission.reading, client, rests)
         stated = Headers(scope=scope).get("content-length", "")
         body = _BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
         connection = _Connection(receive, send, body, rests, on_answer=permit.end)
@@ -104,16 +104,9 @@ class AdmissionMiddleware:
                 admission.cpu_accounts.refuse(client, _REFUSED_S + rests.spent_s)
 
 
-def reading(scope: Scope) -> AbstractAsyncContextManager[None]:
-    """Return a block in which a request holds a permit to read, for answers that are read part by part."""
-    permit: _ReadPermit = scope[_SCOPE_KEY]
-    return permit.for_a_part()
-
-
-def away(scope: Scope) -> AbstractAsyncContextManager[None]:
-    """Return a block in which a request waits for a worker, and others of its client hold the permit to read."""
-    permit: _ReadPermit = scope[_SCOPE_KEY]
-    return permit.away()
+def read_permit(scope: Scope) -> ReadPermit:
+    """Return the permit to read of a request."""
+    return scope[_SCOPE_KEY]
 
 
 class _Rests:
@@ -151,7 +144,7 @@ class _Rests:
         await self.take()
 
 
-class _ReadPermit:
+class ReadPermit:
     """Permit to compute the answer to a read, of which a request holds at most one."""
 
     def __init__(self, semaphore: FairSemaphore, client: str, rests: _Rests) -> None:
@@ -176,7 +169,7 @@ class _ReadPermit:
 
     @asynccontextmanager
     async def for_a_part(self) -> AsyncIterator[None]:
-        """Hold the permit during the block, which is no wait while the request holds it already."""
+        """Hold the permit for a part of the answer, which is no wait while the request holds it already."""
         if self._is_held:
             yield
             return
@@ -185,7 +178,7 @@ class _ReadPermit:
 
     @asynccontextmanager
     async def away(self) -> AsyncIterator[None]:
-        """Give the permit back, and take it again after the block, if the request holds it."""
+        """Give the permit back while the request waits for a worker, so that others of its client read."""
         was_held = self._is_held
         self.end()
         yield
