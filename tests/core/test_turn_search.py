@@ -104,7 +104,7 @@ def test_headings_beside_a_sphere_are_searched_near_its_place(
     counted = lambda *given: compared.append(len(given[1])) or costs(*given)  # noqa: E731
     monkeypatch.setattr(MatchingCost, "costs", counted)
     unknown = [RelativeHeading(index, 0.0, 0.0) for index in range(18)]
-    found = search(headings, unknown, Candidate(*SPOT_M, ROOM, *[0] * 4))
+    found = search(headings, unknown, Candidate(*SPOT_M, ROOM, 0.0, 0, 0.0, 0.0))
     assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
     assert max(compared) <= turn_search._NEAR
     # Few photographs choose the places of many.
