@@ -297,11 +297,14 @@ def _localise(picture: Callable[[int], bytes] = lambda _size: _sphere(), **field
     return work
 
 
-def _sequence(*, padded: bool, venue: bool = False, photographs: int = _PHOTOGRAPHS) -> Work:
-    """Return the work of a sequence, `padded` to `size` tenths of a megabyte in total."""
+def _sequence(*, venue: bool = False, views: bool = False) -> Work:
+    """Return the work of a sequence of spheres, `size` tenths of a megabyte in total, or of `size` views of a turn."""
 
     def work(caller: Caller, stored: Stored, size: int) -> None:
-        files = photographs * (("photo", _padded_picture(size * 10**5 // photographs if padded else 0)),)
+        files = _PHOTOGRAPHS * (("photo", _padded_picture(size * 10**5 // _PHOTOGRAPHS)),)
+        if views:
+            pictures = [(ROOT / f"examples/turn_{number}.jpg").read_bytes() for number in range(1, 5)]
+            files = tuple(("photo", pictures[number % len(pictures)]) for number in range(size))
         place = ("venue_id", stored.venue_id) if venue else ("floorplan_id", stored.plan_id)
         caller.send("POST", "/localise/sequence", *form((place, ("motion", "turn")), files))
 
@@ -510,10 +513,10 @@ LOADS = (
         refusals=_TOO_LONG,
     ),
     Load(("POST /localise/batch",), f"10 photographs, {VERTICES_PLAN}", _batch),
-    _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence(padded=False)),
-    _sequencing("18 photographs of a turn", _sequence(padded=False, photographs=18), connections=4),
-    _sequencing("10 photographs, {homes} homes", _sequence(padded=False, venue=True)),
-    _sequencing("10 photographs of 100 MB in total", _sequence(padded=True), 1_000, connections=44),
+    _sequencing(f"10 photographs, {VERTICES_PLAN}", _sequence()),
+    _sequencing("18 photographs of a phone's turn", _sequence(views=True), 18, connections=4),
+    _sequencing("10 photographs, {homes} homes", _sequence(venue=True)),
+    _sequencing("10 photographs of 100 MB in total", _sequence(), 1_000, connections=44),
     Load(
         (*_SESSIONS, f"GET {_SESSION}", f"DELETE {_SESSION}"),
         f"two photographs, {ROOMS_PLAN}",

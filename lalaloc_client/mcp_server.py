@@ -45,8 +45,9 @@ _INSTRUCTIONS = (
     "its confidence says, tell the user its warnings, and if it is not sure, ask what to do next."
 )
 _DATA, _BASE64, _BEARER = "data:", ";base64,", "Bearer "
-# Size of a request to this server, and of all requests in progress; they take six times that in memory.
-_MAX_BODY_BYTES, _MAX_RECEIVED_BYTES = 2**26, 2**27
+# Size of a request to this server, and of all requests in progress; they take six times that in memory. Values of
+# JSON take thirty times their size, and a request has few besides files.
+_MAX_BODY_BYTES, _MAX_RECEIVED_BYTES, _MAX_VALUES = 2**26, 2**27, 20_000
 _MAX_CONNECTIONS = 64
 # Timeouts for the head of a request, for its body and for its answer; solving an album takes the longest.
 _HEAD_S, _BODY_S, _ANSWER_S = 15.0, 120.0, 900.0
@@ -152,13 +153,17 @@ class _BoundedApp:
         if refusal is None and scope["method"] != "POST":
             # Without sessions, a stream of events would stay open and empty.
             refusal = Response(status_code=405, headers={"Allow": "POST"})
-        size = 0
+        size = values = 0
 
         async def counted() -> Message:
-            nonlocal size
+            nonlocal size, values
             message = await receive()
-            size += (count := len(message.get("body", b"")))
-            self._received_bytes += count
+            body = message.get("body", b"")
+            size += len(body)
+            self._received_bytes += len(body)
+            values += sum(map(body.count, b",[{"))
+            if values > _MAX_VALUES:
+                raise HTTPException(413, f"the limit is {_MAX_VALUES} JSON values; send files as data URLs in base64")
             if self._received_bytes > _MAX_RECEIVED_BYTES:
                 limit = f"the limit of all requests in progress is {_MAX_RECEIVED_BYTES} bytes; try again later"
                 raise HTTPException(503, limit, {"Retry-After": "10"})

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-# Characters that begin a formula in a spreadsheet, also in their full width.
-_FORMULA = frozenset("=+-@＝＋－＠\t\r")
+# Begin of a formula in a spreadsheet, also in other widths, and behind what separates columns in some languages.
+_FORMULA = re.compile(r"(^|[;\t])(?=[\s\ufeff\u200b]*[-=+@＝＋－＠﹦﹢﹣﹫])|^(?=[\t\r])")
 # Control characters, bytes that were no UTF-8, and characters that are none.
 _NO_TEXT = re.compile("[\x00-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef\ufffe\uffff]")
 
@@ -17,7 +17,7 @@ def printable(name: str) -> str:
 
 def no_formula(text: str) -> str:
     """Return text that a spreadsheet does not take for a formula."""
-    return f"'{text}" if _FORMULA.intersection((text[:1], text.lstrip()[:1])) else text
+    return _FORMULA.sub(r"\1'", text)
 
 
 def probability_text(probability: float, decimals: int = 1) -> str:

@@ -159,7 +159,7 @@ class QueryComponents:
         accounts = self.telemetry.cpu_accounts
         # Albums take turns on half the cores, which leaves the others to queries.
         turns = FairSemaphore(max(usable_cores() // 2, 1), accounts)
-        return LocalLocaliser(parts, queries, Threads("albums", AT_A_TIME, accounts), [turns, self.cores])
+        return LocalLocaliser(parts, queries, Threads("albums", AT_A_TIME, accounts), turns, self.cores)
 
     def build_venue_plans(self) -> VenuePlans:
         """Build the lookup of a venue's plans."""

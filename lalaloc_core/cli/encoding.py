@@ -56,7 +56,11 @@ def _encode(arguments: argparse.Namespace) -> None:
     check_sources(arguments)
     if arguments.out is not None and len(arguments.photographs) > 1:
         raise InvalidInputError(f"--out is one file, and there are {len(arguments.photographs)} photographs")
-    check_free((path.with_suffix(".features") for path in arguments.photographs), arguments.photographs)
+    written = [path.with_suffix(".features") for path in arguments.photographs]
+    check_free(written, arguments.photographs)
+    if len({*written}) < len(written):
+        double = max(written, key=written.count)
+        raise InvalidInputError(f"'{double}' would be written twice; encode the photographs one by one, with --out")
     stated, bundle = stated_camera(arguments), Bundle.open(arguments.bundle)
     manifest, encoder = bundle.manifest, FeatureEncoder(bundle)
     if arguments.turn is not None:

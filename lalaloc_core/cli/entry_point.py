@@ -9,6 +9,8 @@ import re
 import runpy
 import sys
 from collections.abc import Mapping
+from glob import escape
+from itertools import chain
 from pathlib import Path
 
 from lalaloc_core import __version__
@@ -75,17 +77,25 @@ def main(argv: list[str] | None = None) -> int:
 def _check_written(values: Mapping[str, object]) -> None:
     """Refuse to write over a file that is read."""
     given = [(name, path) for name, value in values.items() for path in (value if isinstance(value, list) else [value])]
-    paths = [(name, path) for name, path in given if isinstance(path, Path) and os.path.exists(path)]
-    read = [path for name, path in paths if name not in (*_WRITTEN, "bundle")]
+    paths = [(name, path) for name, path in given if isinstance(path, Path)]
+    read = [path for name, path in paths if name not in (*_WRITTEN, "bundle") and os.path.exists(path)]
     for path in [path for path in read if path.suffix.lower() in (".yaml", ".yml") and path.is_file()]:
         from lalaloc_core.importers.formats.ros import map_picture
 
         read += [picture] if (picture := map_picture(path)).exists() else []
-    for out in (path for name, path in paths if name in _WRITTEN and os.path.isfile(path)):
+    # Several files are numbered.
+    named = [path for name, path in paths if name in _WRITTEN and path.name]
+    numbered = (path.parent.glob(f"{escape(path.stem)}-[0-9]*{escape(path.suffix)}") for path in named)
+    for out in filter(os.path.isfile, chain(named, *numbered)):
         # Of a folder, the pictures are read.
-        folder = out.parent if out.suffix.lower() == ".png" else out
-        if any(path.samefile(out) or path.samefile(folder) for path in read):
+        if any(map(out.samefile, read)) or (any(map(out.parent.samefile, read)) and _is_picture(out)):
             raise InvalidInputError(f"'{out}' is read and never changed; write another file")
+
+
+def _is_picture(path: Path) -> bool:
+    from lalaloc_core.photograph.picture_folders import PICTURES
+
+    return path.suffix.lower() in PICTURES
 
 
 def build_parser(*, with_lab: bool = True) -> argparse.ArgumentParser:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lalaloc_core.cli.answer_files import FILES, check_file_options, write_files
 from lalaloc_core.cli.cameras import add_camera_options, stated_camera
 from lalaloc_core.cli.options import BUNDLE, CAMERA_HEIGHT, PLAN, TURN, add_options, check_sources, heading, tolerance
-from lalaloc_core.cli.plan_files import add_plan_options, check_free, check_picture_name, read_plan, write_picture
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import JSON_DECIMALS, pose_cells, print_json, print_table, print_warnings, with_options
 from lalaloc_core.errors import InvalidInputError, InvalidPhotographError
 from lalaloc_core.shown_text import probability_text
@@ -90,7 +90,6 @@ def _localise(arguments: argparse.Namespace) -> None:
         places.append((path.stem, drawn.camera))
         if arguments.out is not None:
             out = arguments.out.with_stem(f"{arguments.out.stem}-{number}") if several else arguments.out
-            check_free([out], arguments.photographs)
             _draw(drawn, path, out, arguments, stated, path.name if several else None)
     print_warnings(warnings)
     write_files(arguments, plan, documents, places)

@@ -51,20 +51,26 @@ def write_pin_files(
     if all(plan.anchor is None for plan in pinned.plans):
         notes.append("the plan has no anchor (docs/reference/plan-format.md), so pins.geojson is left out")
     else:
-        write_file(out / "pins.geojson", json.dumps(_collection(plans, entries)) + "\n")
+        _write(out / "pins.geojson", json.dumps(_collection(plans, entries)) + "\n")
     copied = _write_copies(out / COPIES, plans, paths, entries) if copies else []
     notes += copied
-    write_file(out / "pins.json", json.dumps(document, indent=2) + "\n")
-    write_file(out / "pins.csv", csv_text(_COLUMNS, [[cell(entry) for cell in _COLUMNS.values()] for entry in entries]))
+    _write(out / "pins.json", json.dumps(document, indent=2) + "\n")
+    _write(out / "pins.csv", csv_text(_COLUMNS, [[cell(entry) for cell in _COLUMNS.values()] for entry in entries]))
     rows = [ReportRow(entry, path.read_bytes) for path, entry in zip(paths, entries, strict=True)]
     for number, (plan_id, plan) in enumerate(plans.items()):
         name = "plan.svg" if len(plans) == 1 else f"plan-{number + 1}.svg"
         pins = [row.pin for row in rows if row.pin and row.entry["plan"] == plan_id]
-        write_file(out / name, plan_svg(plan, over=draw_pins(extent_m(plan), pins)))
+        _write(out / name, plan_svg(plan, over=draw_pins(extent_m(plan), pins)))
     title = " / ".join(dict.fromkeys(plan.name for plan in pinned.plans))
     lines = [*report_notes(document["counts"], document["camera_height_m"], pinned.album.warnings), *copied]
-    (out / "report.pdf").write_bytes(draw_pdf(report_pages(title, plans, rows, lines), DPI))
+    _write(out / "report.pdf", draw_pdf(report_pages(title, plans, rows, lines), DPI))
     return document
+
+
+def _write(path: Path, content: str | bytes) -> None:
+    """Write a file anew, as an earlier one can be a link to an original."""
+    path.unlink(missing_ok=True)
+    write_file(path, content)
 
 
 def _collection(plans: Mapping[str, FloorPlan], entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -94,11 +100,9 @@ def _write_copies(
             continue
         plan = plans[entry["plan"]]
         copied, sidecar = placed_copy(source.read_bytes(), stated_place(entry, plan, plan.anchor))
-        # An earlier copy can be a link to the original.
-        (folder / source.name).unlink(missing_ok=True)
-        (folder / source.name).write_bytes(copied)
+        _write(folder / source.name, copied)
         if sidecar is not None:
             name = sidecar_name(source.name, beside)
-            (folder / name).write_bytes(sidecar)
+            _write(folder / name, sidecar)
             beside.add(name.casefold())
     return [f"copies with their place in an .xmp file beside them: {len(beside)}"] if beside else []

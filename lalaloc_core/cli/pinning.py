@@ -97,7 +97,8 @@ def _check_out(out: Path, sources: Iterable[Path | None], *, replace: bool) -> N
 
     written = [folder for folder in (out, out / COPIES) if folder.is_dir()]
     sources = [path for path in sources if path is not None and path.exists()]
-    read = next((path for path in sources if any(map(path.resolve().parent.samefile, written))), None)
+    places = ((path, folder) for path in sources for folder in (path.parent, path.resolve().parent))
+    read = next((path for path, folder in places if any(map(folder.samefile, written))), None)
     if read is not None:
         raise InvalidInputError(
             f"--out would write beside '{printable(str(read))}', which is read and never changed; choose another folder"

@@ -83,13 +83,19 @@ class CpuAccounts:
         return max(self._accounts.get(client, _NOTHING).refused_until - self._clock(), 0.0)
 
     @contextmanager
-    def charged(self, client: str, *, rests: bool = False) -> Iterator[None]:
-        """Charge the CPU time that this thread uses in the block."""
+    def charged(self, client: str, *, rests: bool = False) -> Iterator[Callable[[], None]]:
+        """Charge the CPU time that this thread uses in the block; the function charges what it used until then."""
         begin = thread_time()
+
+        def charge() -> None:
+            nonlocal begin
+            before, begin = begin, thread_time()
+            self.charge(client, begin - before, rests=rests)
+
         try:
-            yield
+            yield charge
         finally:
-            self.charge(client, thread_time() - begin, rests=rests)
+            charge()
 
     @coroutine
     def charged_steps(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from bisect import insort
 from collections import Counter, OrderedDict, deque
 from collections.abc import AsyncIterator, Callable, Iterator, Set
 from concurrent.futures import Future
@@ -75,10 +76,13 @@ class Shares:
 
 
 class FairQueue(Generic[T]):
-    """Queue that serves the client with the least recent CPU time, oldest item first. Not thread-safe."""
+    """Queue that serves the client with the least recent CPU time, its item of the lowest `order`, the oldest, first.
 
-    def __init__(self, accounts: CpuAccounts) -> None:
-        self._accounts = accounts
+    Not thread-safe.
+    """
+
+    def __init__(self, accounts: CpuAccounts, order: Callable[[T], float] = lambda _item: 0.0) -> None:
+        self._accounts, self._order = accounts, order
         self._waiting: OrderedDict[str, deque[T]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -90,7 +94,7 @@ class FairQueue(Generic[T]):
 
     def append(self, client: str, item: T) -> None:
         """Append an item of a client."""
-        self._waiting.setdefault(client, deque()).append(item)
+        insort(self._waiting.setdefault(client, deque()), item, key=self._order)
 
     def append_first(self, client: str, item: T) -> None:
         """Put an item before all others of its client, and the client before its equals."""
@@ -193,6 +197,13 @@ class FairSemaphore:
             yield
         finally:
             self.release(client)
+
+    def give_way(self, client: str) -> None:
+        """Release a permit to waiting clients with less CPU time lately, if any, and wait for it anew, on a thread."""
+        # Queued before the release, which others get otherwise whatever they used.
+        permit = self._queued(client)
+        self.release(client)
+        permit.result()
 
     def release(self, client: str) -> None:
         """Release a permit."""

@@ -16,8 +16,14 @@ from service.errors import StoreUnavailableError
 P = ParamSpec("P")
 T = TypeVar("T")
 
-# Client of the call that a thread computes.
+# Client of the call that a thread computes, and the function that charges what the call used until now.
 _CLIENT: ContextVar[str] = ContextVar("client", default=PROBES)
+_CHARGE: ContextVar[Callable[[], None]] = ContextVar("charge")
+
+
+def charge_until_now() -> None:
+    """Charge the CPU time of this thread's call, which goes on: others with less are served first from now on."""
+    _CHARGE.get()()
 
 
 class Threads:
@@ -62,7 +68,8 @@ class Threads:
 
     def _charged(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
         _CLIENT.set(client)
-        with self._accounts.charged(client, rests=self._rests):
+        with self._accounts.charged(client, rests=self._rests) as charge:
+            _CHARGE.set(charge)
             return work(*args, **kwargs)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:

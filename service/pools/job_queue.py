@@ -87,7 +87,8 @@ class JobQueue:
         self, limit: int, served_by: Callable[[float], bool], accounts: CpuAccounts, workers: Shares | None = None
     ) -> None:
         self.accounts, self._served_by, self._workers = accounts, served_by, workers
-        self._waiting: FairQueue[PendingJob] = FairQueue(accounts)
+        # Of a client's queries, the one that ends first: in turns, none would be answered in time.
+        self._waiting: FairQueue[PendingJob] = FairQueue(accounts, lambda pending: pending.deadline)
         self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
         self._changed, self._closed = threading.Condition(), False

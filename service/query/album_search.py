@@ -23,7 +23,7 @@ from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.bounded_cache import BoundedCache
 from service.capacity.admission_control import Slots
 from service.capacity.fair_share import FairSemaphore
-from service.capacity.threads import Threads
+from service.capacity.threads import Threads, charge_until_now
 from service.query.album_answers import compose_outcome
 from service.query.ground import Ground
 from service.query.grounds import spread
@@ -48,11 +48,13 @@ class _Stopped(Exception):
 class AlbumSearch:
     """Solver of albums, on threads of its own: a solve can take longer than queries may wait.
 
-    A solve holds a permit of each of the `cores` while it computes, and passes them on after each photograph.
+    A solve holds one of the `turns` and of the `cores` while it computes, and passes them on after each photograph.
     """
 
-    def __init__(self, parts: QueryParts, queries: Slots, threads: Threads, cores: Sequence[FairSemaphore]) -> None:
-        self._parts, self._queries, self._threads, self._cores = parts, queries, threads, cores
+    def __init__(
+        self, parts: QueryParts, queries: Slots, threads: Threads, turns: FairSemaphore, cores: FairSemaphore
+    ) -> None:
+        self._parts, self._queries, self._threads, self._turns, self._cores = parts, queries, threads, turns, cores
         # Found by an earlier solve of the same album; a solve takes it out, as two must not share it.
         self._memories = BoundedCache[str, AlbumMemory](_MEMORY_BYTES, _size_of)
 
@@ -113,11 +115,7 @@ class AlbumSearch:
             stated.append(replace(entry, correction=correction))
         stored = {id: part.evidence for id, part in parts.items() if part.evidence is not None}
         memory = self._memories.pop(query.album_id) or AlbumMemory(stored=stored)
-        begin_s, memory.spent_s = thread_time() - memory.spent_s, 0.0
-
-        def hold() -> None:
-            for semaphore in self._cores:
-                held.enter_context(semaphore.hold(query.context.client))
+        begin_s, memory.spent_s, client = thread_time() - memory.spent_s, 0.0, query.context.client
 
         def progress(done: int) -> None:
             query.progress.share = done / max(len(stated), 1)
@@ -125,9 +123,11 @@ class AlbumSearch:
             query.progress.found[parts[newest].id] = memory.to_bytes(newest)
 
         def pause() -> None:
-            # Others that wait for the core compute in between.
+            # Others that wait for the core and used less lately compute in between.
+            charge_until_now()
             held.close()
-            hold()
+            self._turns.give_way(client)
+            held.enter_context(self._cores.hold(client))
             # Looked at last: of several solves that stop and wait for each other, none computes any more.
             spent_s = thread_time() - begin_s
             if query.progress.stopped:
@@ -137,8 +137,8 @@ class AlbumSearch:
                 raise InvalidInputError(f"it took {_MAX_CPU_S:g} s of CPU time, which is the limit: divide the album")
 
         try:
-            with ExitStack() as held:
-                hold()
+            with self._turns.hold(client), ExitStack() as held:
+                held.enter_context(self._cores.hold(client))
                 album = solve_album(places, self._parts.encoder, stated, memory=memory, progress=progress, pause=pause)
         finally:
             # The next attempt goes on from here.

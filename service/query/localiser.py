@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from typing import Any, Protocol, TypeVar
 
 from lalaloc_core.localise.answers.documents import ModelAnswer
@@ -46,11 +46,11 @@ class LocalLocaliser:
     """Localisation in this process: each query holds a slot while it computes, not while it waits for grids."""
 
     def __init__(
-        self, parts: QueryParts, queries: Slots, album_threads: Threads, album_cores: Sequence[FairSemaphore]
+        self, parts: QueryParts, queries: Slots, album_threads: Threads, turns: FairSemaphore, cores: FairSemaphore
     ) -> None:
         self.model = ModelAnswer.of(parts.bundle)
         self._parts, self._queries = parts, queries
-        single, albums = SingleSearch(parts), AlbumSearch(parts, queries, album_threads, album_cores)
+        single, albums = SingleSearch(parts), AlbumSearch(parts, queries, album_threads, turns, cores)
         self._albums = albums
         self._searches: dict[type[AnyQuery[Any]], Callable[[Where, Any], Awaitable[Any]]] = {
             PhotographQuery: single.answer,

@@ -18,7 +18,7 @@ from service.errors import InvalidRequestError, UnknownFloorPlanError, UnknownRe
 from service.http import IdempotentRequest
 from service.http.fields import Model, parse_document
 from service.http.idempotent_request import HEADER
-from service.http.middleware.admission import reading
+from service.http.middleware.admission import read_permit
 from service.http.representations import expected_revision, not_modified, revision_etag, tagged_answer
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.plan_documents import Rendition, RenditionKind
@@ -145,12 +145,17 @@ class ApiCall:
         return await self.runtime.reads.run(self.tenant, work, *args, **kwargs)
 
     async def process(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Run work on what was read, on the same threads; see `BoundedReads.process`."""
-        return await self.runtime.reads.process(self.tenant, work, *args, **kwargs)
+        """Run work on what was read, on the same threads, after which the client rests; see `BoundedReads.process`."""
+
+        def charged() -> T:
+            with self.runtime.telemetry.cpu_accounts.charged(self.client, rests=True):
+                return work(*args, **kwargs)
+
+        return await self.runtime.reads.process(self.tenant, charged)
 
     def reading(self) -> AbstractAsyncContextManager[None]:
         """Return a block that holds a permit to read, for answers that are read part by part."""
-        return reading(self.request.scope)
+        return read_permit(self.request.scope).for_a_part()
 
     def plan(self, floorplan_id: str) -> PlanSummary:
         """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted. Blocks."""
@@ -173,7 +178,8 @@ class ApiCall:
 
     async def rendition(self, plan: PlanSummary | PlanRecord, kind: RenditionKind) -> Rendition:
         """Return a file made from a stored plan; see `RenditionCache.get`."""
-        return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
+        async with read_permit(self.request.scope).away():
+            return await self.runtime.renditions.get(plan.id, plan.revision_id, kind, self.client)
 
     def venue(self, venue_id: str) -> VenueRecord:
         """Return a stored venue. Blocks."""

@@ -204,7 +204,12 @@ def _listens(port: int) -> bool:
 @pytest.fixture
 def http_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     """Return the port of a server over HTTP with small limits."""
-    for name, limit in {"_MAX_BODY_BYTES": 3000, "_MAX_RECEIVED_BYTES": 4000, "_MAX_CONNECTIONS": 3}.items():
+    for name, limit in {
+        "_MAX_BODY_BYTES": 3000,
+        "_MAX_RECEIVED_BYTES": 4000,
+        "_MAX_CONNECTIONS": 3,
+        "_MAX_VALUES": 90,
+    }.items():
         monkeypatch.setattr(mcp_server, name, limit)
     port = free_port()
     server = mcp_server.make_http_server(f"http://127.0.0.1:{port}", "127.0.0.1", port)
@@ -237,6 +242,7 @@ def _head(*lines: str, method: str = "POST", host: str = "127.0.0.1:8765") -> st
         (_head("Content-Length: 9", "Origin: http://localhost.page.example:80"), b"403"),
         (_head("Content-Length: 3001"), b"413"),
         (_head("Transfer-Encoding: chunked") + f"bb9\r\n{'a' * 3001}\r\n", b"413"),
+        (_head("Content-Length: 999") + 40 * "[{},", b"413"),
         (_head(method="GET"), b"405"),
     ],
 )

@@ -131,6 +131,26 @@ def test_several_photographs_give_rows_and_pictures(
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("answer-1.svg", KITCHEN, BEDROOM, "--out", "answer.svg"),
+        (PLAN, "--turn", "turn", "--csv", "turn/1.jpg"),
+        (PLAN, "--turn", "turn", "--csv", "link"),
+    ],
+)
+def test_no_file_that_is_read_is_written(
+    arguments: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "answer-1.svg").touch()
+    (tmp_path / "turn").mkdir()
+    (tmp_path / "turn" / "1.jpg").touch()
+    (tmp_path / "link").symlink_to(PLAN)
+    with contextlib.chdir(tmp_path):
+        assert main(["localise", *arguments]) == 2
+    assert "is read and never changed" in capsys.readouterr().err
+
+
 def test_many_photographs_give_a_table_places_on_earth_and_a_map(
     tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

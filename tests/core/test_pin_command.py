@@ -167,14 +167,19 @@ def test_no_file_is_overwritten_unasked(
 @pytest.mark.slow
 def test_copies_are_not_written_through_links(pinned: tuple[Path, Path]) -> None:
     original, copy = (folder / "kitchen.jpg" for folder in (pinned[0], pinned[1] / "photographs"))
-    copy.unlink()
-    copy.hardlink_to(original)
-    assert main(["pin", f"{pinned[0].parent}/flat.json", str(pinned[0]), "--out", str(pinned[1]), "--replace"]) == 0
+    plan, table = pinned[0].parent / "flat.json", pinned[1] / "pins.csv"
+    for written, read in ((copy, original), (table, plan)):
+        written.unlink()
+        written.hardlink_to(read)
+    before = plan.read_bytes()
+    assert main(["pin", str(plan), str(pinned[0]), "--out", str(pinned[1]), "--replace"]) == 0
+    assert plan.read_bytes() == before
     assert original.read_bytes() == (EXAMPLES / "kitchen.jpg").read_bytes() != copy.read_bytes()
 
 
 def test_shown_names_hold_no_formulas_or_control_characters() -> None:
-    assert [no_formula(text) for text in ("=1", "-1", " ＝1", "a=1", "")] == ["'=1", "'-1", "' ＝1", "a=1", ""]
+    texts = ("=1", "-1", " ＝1", "a=1", "a; +1", "")
+    assert [no_formula(text) for text in texts] == ["'=1", "'-1", "' ＝1", "a=1", "a;' +1", ""]
     assert printable("K\udcffche\x07\ufffe.jpg") == "K\ufffdche\ufffd\ufffd.jpg"
     copy, _ = placed_copy(_picture("JPEG"), replace(PLACE, room="K\ufffeche"))
     with Image.open(io.BytesIO(copy)) as picture:

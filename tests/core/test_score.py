@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lalaloc_core.cli import main
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluate.methods.method import Pose
-from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, is_symmetric, summarise, symmetric_by_chance, write_worst
+from lalaloc_core.evaluate.report.worst import SUMMARY_FILE, summarise, write_worst
 from lalaloc_core.evaluate.runs.evaluation import run_evaluation
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, SCORES_FILE, Prediction, RunFolder
 from lalaloc_core.evaluate.runs.score import (
@@ -22,14 +22,13 @@ from lalaloc_core.evaluate.runs.score import (
     choose_worst,
     expected_calibration_error,
     heading_errors_deg,
-    outcomes,
     position_errors_m,
     reliability_bins,
     score,
     score_run,
 )
 from tests.core.questions import prediction_of, run_info
-from tests.strategies import plan_of, present, rectangle
+from tests.strategies import present
 
 INFO = run_info()
 
@@ -236,33 +235,13 @@ class TestRunFolder:
         assert position_errors_m(folder.read_predictions())[2] == pytest.approx(0.1)
 
 
-# A room from (0, 0) to (6, 4) with its camera in the lower left corner.
-PLAN = plan_of(rectangle(6.0, 4.0))
 TRUTH = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=0.0)
 
 
-def found_at(x_m: float | None, y_m: float = 1.0, room: int = 0, facts: tuple[str, ...] = ()) -> Prediction:
+def found_at(x_m: float | None) -> Prediction:
     """Return a prediction after a right first stage; None: no answer."""
-    stages = {} if x_m is None else {"retrieval": TRUTH, "lpo": replace(TRUTH, x_m=x_m, y_m=y_m, room_index=room)}
-    return prediction_of(TRUTH, stages=stages, facts=facts, confidence=0.5)
-
-
-class TestFailures:
-    @pytest.mark.parametrize(
-        ("x_m", "y_m", "symmetric"),
-        [(5.0, 1.0, True), (1.0, 3.0, True), (5.2, 2.8, True), (3.0, 2.0, False), (1.1, 1.0, False)],
-    )
-    def test_mirrored_poses_are_recognised(self, x_m: float, y_m: float, symmetric: bool) -> None:
-        assert is_symmetric(PLAN, found_at(x_m, y_m)) == symmetric
-
-    def test_chance_is_share_of_mirrored_positions_in_the_right_room(self) -> None:
-        rng = np.random.default_rng(0)
-        everywhere = [found_at(x, y) for x, y in rng.uniform((0.0, 0.0), (6.0, 4.0), (2000, 2))]
-        wrong = [pose for pose in everywhere if outcomes([pose]) == [Outcome.WRONG_ALIGNMENT]]
-        share = np.mean([is_symmetric(PLAN, pose) for pose in wrong])
-        assert symmetric_by_chance(PLAN, wrong[0]) == pytest.approx(share, abs=0.02)
-        assert not is_symmetric(PLAN, found_at(None))
-        assert not is_symmetric(PLAN, found_at(5.0, 1.0, room=1))
+    stages = {} if x_m is None else {"retrieval": TRUTH, "lpo": replace(TRUTH, x_m=x_m)}
+    return prediction_of(TRUTH, stages=stages, confidence=0.5)
 
 
 class TestSummary:
@@ -271,19 +250,10 @@ class TestSummary:
         assert choose_worst([near, far, missed], 2) == [missed, far]
         assert choose_worst([near, far], 5) == [far, near]
 
-    def test_facts_are_compared_with_all_queries(self) -> None:
-        corridor, mirror = ("corridor",), ("mirror",)
-        every = [found_at(4.0, facts=corridor), found_at(None, facts=corridor)]
-        every += [found_at(1.1, facts=facts) for facts in (corridor, mirror, mirror, mirror, (), ())]
+    def test_outcomes_are_counted(self) -> None:
+        every = [found_at(4.0), found_at(None), found_at(1.1)]
         summary = summarise(every, every[:2], [])
-        assert summary["facts"] == {
-            "corridor": {"worst": 1.0, "all": 3 / 8, "lift": pytest.approx(8 / 3)},
-            "mirror": {"worst": 0.0, "all": 3 / 8, "lift": 0.0},
-        }
         assert summary["outcomes"] == {"located": 0, "wrong alignment": 1, "wrong room": 0, "no answer": 1}
-        assert summary["error_m"] == {"least": 3.0, "most": 3.0}
-        # The answered query had a right first stage.
-        assert summary["lost_after_first_stage"] == 1
 
 
 @pytest.fixture(scope="module")
@@ -311,7 +281,6 @@ class TestWorst:
         # Costs of a layout query are zero except at doors, which can be seen through.
         for query in worst:
             assert query["true_cost"] < 0.2
-            assert abs(query["distance_bias"]) < 1e-3
             assert query["found_cost"] is None or query["found_cost"] > query["true_cost"]
         assert summary["true_pose_fits"] == {"compared": 2, "better_than_found": 2}
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import defaultdict
 from dataclasses import dataclass
@@ -119,15 +118,6 @@ class TestDepth:
         grid = DepthGrid(plan, poses, CAMERA_M, relative=relative, rows=ROWS, columns=COLUMNS)
         np.testing.assert_allclose(grid.distances(query), expected, atol=1e-5)
 
-    def test_relative_depth_ignores_scale(self) -> None:
-        half, whole = plan_of(rectangle(3.0, 2.5), ceiling_m=2.5), plan_of(rectangle(6.0, 5.0), ceiling_m=5.0)
-        poses = some_poses(half, 0, 5)
-        grid = DepthGrid(half, poses, CAMERA_M, relative=True)
-        for index, position in enumerate(poses.position_m):
-            query = layout_at(whole, 2.0 * position, grid.columns, 2.0 * CAMERA_M)
-            assert grid.distances(query)[index] < 1e-6
-            assert DepthGrid(half, poses, CAMERA_M).distances(query)[index] > 0.5
-
 
 class TestEdges:
     @given(plan=plans(), seed=seeds())
@@ -149,28 +139,6 @@ class TestEdges:
         expected = [slow(pixels(layout_at(plan, position, 32)), pixels(query)) for position in poses.position_m]
         grid = EdgeGrid(plan, poses, CAMERA_M, rows=16, columns=32)
         np.testing.assert_allclose(grid.distances(query), expected, atol=1e-5)
-
-    def test_square_room_has_two_lines_and_four_corners(self) -> None:
-        plan = plan_of(rectangle(4.0, 4.0), ceiling_m=2.8)
-        # At the centre: corners at odd multiples of 45 degrees, foot and top of walls at 35 degrees.
-        layout = layout_at(plan, np.array([2.0, 2.0]), 128, 1.4)
-        edges = edge_image(layout.profile_m[None], np.array([1.4]), np.array([2.8]), 64)[0]
-        corners = np.flatnonzero(edges[32])
-        np.testing.assert_array_equal(corners, [15, 16, 47, 48, 79, 80, 111, 112])
-        np.testing.assert_array_equal(edges, edges[::-1])
-        between = edges[:, 32]
-        assert np.flatnonzero(between).tolist() == [
-            math.floor((0.5 - math.atan(1.4 / 2.0) / math.pi) * 64),
-            math.floor((0.5 + math.atan(1.4 / 2.0) / math.pi) * 64),
-        ]
-
-    def test_occlusion_is_an_edge(self) -> None:
-        plan = plan_of([[0, 0], [6, 0], [6, 2], [2, 2], [2, 6], [0, 6]])
-        layout = layout_at(plan, np.array([4.0, 1.0]), 256)
-        edges = edge_image(layout.profile_m[None], np.array([CAMERA_M]), np.array([2.5]), 128)[0]
-        # The inner corner hides the upper arm: seen from the camera it lies 2 m to the left and 1 m ahead.
-        column = (math.atan2(-2.0, 1.0) / (2.0 * math.pi) + 0.5) * 256 - 0.5
-        assert edges[64, [math.floor(column), math.ceil(column)]].all()
 
 
 class TestAnyMetric:
@@ -208,17 +176,6 @@ class TestRetrieval:
         answer = PoseOracle().locate(question)
         assert (answer.retrieved, answer.stages["retrieval"].room_index) == (1, 1)
         assert SimilarityRetrieval().locate(question).retrieved == 0
-
-
-def test_grids_are_cached_by_plan_and_camera_height() -> None:
-    plan, method = crooked_flat(), SimilarityRetrieval()
-    first = question_at(plan, (1.0, 1.0))
-    grid = method._grid(first)
-    assert method._grid(first) is grid
-    assert method._grid(dataclasses.replace(first, plan=crooked_flat())) is not grid
-    raised = dataclasses.replace(first.camera, camera_height_m=first.camera.camera_height_m + 0.1)
-    assert method._grid(dataclasses.replace(first, camera=raised)) is not grid
-    assert method._grid(first) is grid
 
 
 class TestParts:
@@ -289,26 +246,6 @@ class TestAlign:
         # A scan turned by -off (counter-clockwise for positive off) is turned back clockwise.
         assert abs(result.turn[best] + off) < 0.005
         assert result.rms_m[best] < 0.02
-
-    def test_starts_are_independent(self) -> None:
-        plan, config = crooked_flat(), IcpConfig()
-        tree = KDTree(wall_cloud(plan, config))
-        scan = merge_cells(scan_of(question_at(plan, (1.1, 1.2)).true_profile(256)[None], 0.0), config.cell_m)
-        starts = pose_grid(plan, 1.0).position_m
-        together = align(scan, tree, starts, config)
-        for index in range(len(starts)):
-            alone = align(scan, tree, starts[index : index + 1], config)
-            np.testing.assert_allclose(alone.shift_m[0], together.shift_m[index], atol=1e-9)
-            np.testing.assert_allclose(alone.rms_m[0], together.rms_m[index], atol=1e-9)
-
-    def test_reported_distance_is_to_nearest_points(self) -> None:
-        config, cloud = IcpConfig(max_iterations=3), np.random.default_rng(0).normal(size=(40, 2))
-        scan = np.random.default_rng(1).normal(size=(12, 2))
-        result = align(scan, KDTree(cloud), np.array([[0.3, -0.2]]), config)
-        cosine, sine = math.cos(result.turn[0]), math.sin(result.turn[0])
-        moved = scan @ np.array([[cosine, sine], [-sine, cosine]]) + result.shift_m[0]
-        nearest = np.linalg.norm(moved[:, None] - cloud[None], axis=2).min(axis=1)
-        assert result.rms_m[0] == pytest.approx(math.sqrt(np.mean(nearest**2)))
 
 
 class TestMethod:

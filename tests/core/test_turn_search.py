@@ -12,8 +12,8 @@ import pytest
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.encode.layout_encoder import build_grid
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.match import MatchingConfig, PoseGrid
-from lalaloc_core.localise.query import CameraHeight, Query
+from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PoseGrid
+from lalaloc_core.localise.query import CameraHeight, Candidate, Query
 from lalaloc_core.localise.search import turn_search
 from lalaloc_core.localise.search.pipeline import localise, run_steps
 from lalaloc_core.localise.search.turn_search import RelativeHeading, SearchedTurn, TurnLocalisation, searched_turn
@@ -38,9 +38,9 @@ def query_at(encoders: PhotographEncoder, heading: float) -> Query:
 
 @pytest.fixture
 def search(grid: PoseGrid, encoders: PhotographEncoder) -> partial[SearchedTurn]:
-    def found(headings: list[float], relative: list[RelativeHeading]) -> SearchedTurn:
+    def found(headings: list[float], relative: list[RelativeHeading], place: Candidate | None = None) -> SearchedTurn:
         queries = [query_at(encoders, heading) for heading in headings]
-        return run_steps(searched_turn(PLAN, grid, encoders.layouts, queries, relative, MatchingConfig()), None)
+        return run_steps(searched_turn(PLAN, grid, encoders.layouts, queries, relative, MatchingConfig(), place), None)
 
     return partial(found)
 
@@ -95,6 +95,23 @@ def test_unknown_relative_headings_are_found_in_few_places(
     monkeypatch.setattr(turn_search, "_MAX_PLACES", 8)
     found = search(headings[:2], [RelativeHeading(index, 0.0, 0.0) for index in range(2)])
     assert misses_deg(found, headings[:2]).max() < 0.75 * 360.0 / HEADINGS
+
+
+def test_headings_beside_a_sphere_are_searched_near_its_place(
+    search: partial[SearchedTurn], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headings, costs, compared = [0.3, 1.5, 4.0] * 6, MatchingCost.costs, list[int]()
+    counted = lambda *given: compared.append(len(given[1])) or costs(*given)  # noqa: E731
+    monkeypatch.setattr(MatchingCost, "costs", counted)
+    unknown = [RelativeHeading(index, 0.0, 0.0) for index in range(18)]
+    found = search(headings, unknown, Candidate(*SPOT_M, ROOM, 0.0, 0, 0.0, 0.0))
+    assert misses_deg(found, headings).max() < 0.75 * 360.0 / HEADINGS
+    assert max(compared) <= turn_search._NEAR
+    # Few photographs choose the places of many.
+    monkeypatch.setattr(turn_search, "_MAX_PLACES", 8)
+    compared.clear()
+    search(headings, unknown)
+    assert sum(count > 8 for count in compared) == turn_search._MAX_CHOOSING
 
 
 def test_relative_headings_within_groups_are_kept(search: partial[SearchedTurn]) -> None:

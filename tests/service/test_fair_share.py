@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from lalaloc_core.floorplan import FloorPlan
 from service.capacity.cpu_accounts import PROBES, CpuAccounts
 from service.capacity.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
-from service.capacity.threads import BoundedReads, IdleCores, Threads
+from service.capacity.threads import BoundedReads, IdleCores, Threads, charge_until_now
 from service.errors import StoreUnavailableError
 from service.security.permissions import network_of
 from service.storage.records import NewPlan, Original
@@ -297,6 +297,36 @@ def test_permits_are_shared_fairly() -> None:
         return order
 
     assert asyncio.run(scenario()) == ["b", "a", "a", "a"]
+
+
+def test_call_gives_way_only_to_clients_that_used_less() -> None:
+    async def scenario() -> int:
+        accounts, steps, ended = CpuAccounts(), {"a": 0, "b": 0}, threading.Event()
+        turns, threads = FairSemaphore(1, accounts), Threads("test", 4, accounts)
+
+        def compute(client: str, step_s: float) -> int:
+            with turns.hold(client):
+                while steps["b"] < 20 and not ended.is_set():
+                    begin = thread_time()
+                    while thread_time() - begin < step_s:
+                        pass
+                    steps[client] += 1
+                    charge_until_now()
+                    turns.give_way(client)
+                ended.set()
+            return steps["a"]
+
+        large = asyncio.create_task(threads.run("a", compute, "a", 0.05))
+        while (before := steps["a"]) < 3:
+            await asyncio.sleep(0.01)
+        try:
+            return await threads.run("b", compute, "b", 0.001) - before
+        finally:
+            ended.set()
+            await large
+            threads.close()
+
+    assert asyncio.run(scenario()) <= 3
 
 
 def test_abandoned_thread_still_counts_for_its_client() -> None:

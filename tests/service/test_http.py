@@ -252,6 +252,7 @@ _EVERYWHERE = {
         ("GET", "/floorplans/none", 404),
         ("GET", "/no/such/route", 404),
         ("PUT", "/localise", 405),
+        ("OPTIONS", "/readyz", 405),
     ],
 )
 def test_answers_have_security_headers(client: httpx.Client, method: str, path: str, status: int) -> None:

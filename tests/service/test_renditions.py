@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import threading
 from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from service.storage import Store
 from service.storage.records import NewPlan, Original
 from service.telemetry import Telemetry
 from tests.growth import assert_no_worse_than_linear
-from tests.service.conftest import FLAT, StartApp, assert_problem, tiled_plan, upload
+from tests.service.conftest import FLAT, StartApp, assert_problem, metric, tiled_plan, upload, wait_for
 from tests.strategies import plan_of, present, spiral
 
 READS = ["", "/layout", "/preview.svg", "/mesh.glb", "/original", "/export", "/export?format=dxf"]
@@ -94,6 +95,20 @@ def test_file_is_made_once_for_all_requests(store: Store, cache: RenditionCache,
 
     asyncio.run(request())
     assert maker.made == ["mesh", "layout"]
+
+
+@pytest.mark.one_replica
+def test_reads_of_a_client_do_not_wait_for_its_files(client: httpx.Client, maker: _BlockedMaker) -> None:
+    plan_id = upload(client)
+    with ThreadPoolExecutor(3) as threads:
+        paths = [f"/floorplans/{plan_id}/{kind}" for kind in ("layout", "mesh.glb", "export?format=geojson")]
+        made = [threads.submit(client.get, path) for path in paths]
+        try:
+            wait_for(lambda: metric(client, "lalaloc_reads_in_flight") == len(made))
+            assert client.get("/limits", timeout=10.0).status_code == 200
+        finally:
+            maker.release.set()
+        assert [answer.result().status_code for answer in made] == [200] * 3
 
 
 def test_pending_files_are_shared_and_abandoned_ones_are_not_made(

@@ -314,8 +314,8 @@ def test_answers_to_all_photographs_are_a_table(desktop: Visit) -> None:
     with download.value.path().open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["photograph"] for row in rows] == ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"]
-    texts = page.evaluate("async () => ['-1', ' ＝1', 'a'].map((await import('/web/app.js')).quoted)")
-    assert texts == ["'-1", "' ＝1", "a"]
+    texts = page.evaluate("async () => ['-1', ' ＝1', 'a;=1', 'a'].map((await import('/web/app.js')).quoted)")
+    assert texts == ["'-1", "' ＝1", "a;'=1", "a"]
     table.get_by_role("button", name="bedroom.jpg").click()
     expect(page.locator(".thumb[aria-pressed='true']")).to_contain_text("✓")
     expect(page.locator("#answer .room")).to_have_text(rows[2]["room"])

@@ -53,7 +53,7 @@ const nameOf = (photo: Photo): string => photo.file.name.replace(/^example-/, ""
 
 /** Quote a value of a CSV file, which spreadsheets do not take for a formula, as in lalaloc_core/shown_text.py. */
 export function quoted(value: string): string {
-  const safe = /^\s*[-=+@＝＋－＠]|^[\t\r]/.test(value) ? `'${value}` : value;
+  const safe = value.replace(/(^|[;\t])(?=[\s\ufeff\u200b]*[-=+@＝＋－＠﹦﹢﹣﹫])|^(?=[\t\r])/g, "$1'");
   return /[",\r\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
 }
 

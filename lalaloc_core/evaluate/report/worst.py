@@ -10,22 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 
 from lalaloc_core.errors import BundleError, DatasetError, LaLaLocError, RunError
 from lalaloc_core.evaluate.methods.lalaloc import cost_of_pose, encode, read_image
-from lalaloc_core.evaluate.methods.method import Pose
 from lalaloc_core.evaluate.runs.evaluation import question_of
 from lalaloc_core.evaluate.runs.factories import build_dataset, require_bundle
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import ALIGNMENT_LIMIT_M, Outcome, choose_worst, outcomes, position_errors_m
+from lalaloc_core.evaluate.runs.score import Outcome, choose_worst, outcomes, position_errors_m
 from lalaloc_core.files import atomic_write
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.localise.encode.photograph_encoder import PhotographEncoder
-from lalaloc_core.localise.query import Query
 from lalaloc_core.render.sampling import pose_grid
-from lalaloc_core.render.sweep import profiles_at
 
 SUMMARY_FILE = "worst.json"
 # Distance to a query's place in its run beyond which the data set has changed.
@@ -38,11 +33,8 @@ class WorstQuery:
 
     Attributes:
         first_error_m: position error after the first stage.
-        symmetric: whether the pose fits the mirrored room; see `is_symmetric`.
-        symmetric_by_chance: probability of that for a random wrong position in the room.
         true_cost, found_cost: matching cost of the true and of the found pose; None if the model predicts no wall
             profile. The search missed a true pose with a lower cost; no search finds one with a higher cost.
-        distance_bias: median relative error of the predicted distance of walls; negative for too near.
     """
 
     scene: str
@@ -54,11 +46,8 @@ class WorstQuery:
     first_error_m: float | None
     confidence: float | None
     facts: tuple[str, ...]
-    symmetric: bool
-    symmetric_by_chance: float
     true_cost: float | None = None
     found_cost: float | None = None
-    distance_bias: float | None = None
 
 
 def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
@@ -85,44 +74,15 @@ def summarise(
     predictions: Sequence[Prediction], chosen: Sequence[Prediction], examined: Sequence[WorstQuery]
 ) -> dict[str, Any]:
     """Return the common features of the worst queries as plain data."""
-    errors_m = position_errors_m(chosen)
-    answered = errors_m[~np.isnan(errors_m)]
-    misaligned = [query for query in examined if query.outcome is Outcome.WRONG_ALIGNMENT]
     pairs = [(query.true_cost, query.found_cost) for query in examined]
     costs = [(true, found) for true, found in pairs if true is not None and found is not None]
-    biases = [query.distance_bias for query in examined if query.distance_bias is not None]
     kinds = outcomes(chosen)
-    first = next((name for prediction in predictions for name in prediction.stages), None)
-    started_m = position_errors_m(chosen, first) if first is not None else np.full(len(chosen), np.nan)
     return {
         "queries": len(predictions),
         "chosen": len(chosen),
-        "error_m": {"least": float(answered.min()), "most": float(answered.max())} if len(answered) else None,
         "outcomes": {kind.value: kinds.count(kind) for kind in Outcome},
-        "mirrored": {
-            "among_wrong_alignment": sum(query.symmetric for query in misaligned),
-            "expected_by_chance": sum(query.symmetric_by_chance for query in misaligned),
-        },
-        "lost_after_first_stage": int(((started_m < 1.0) & ~(errors_m < 1.0)).sum()),
         "true_pose_fits": {"compared": len(costs), "better_than_found": sum(true < found for true, found in costs)},
-        "median_distance_bias": float(np.median(np.abs(biases))) if biases else None,
-        "mean_confidence": {"worst": _mean_confidence(chosen), "all": _mean_confidence(predictions)},
-        "facts": _lifts(predictions, chosen),
     }
-
-
-def _lifts(predictions: Sequence[Prediction], chosen: Sequence[Prediction]) -> dict[str, dict[str, float]]:
-    """Return, by fact, its share among the worst and among all queries, and their ratio, largest first."""
-    lifts = {}
-    for fact in sorted({fact for prediction in predictions for fact in prediction.facts}):
-        worst, total = (sum(fact in query.facts for query in part) / len(part) for part in (chosen, predictions))
-        lifts[fact] = {"worst": worst, "all": total, "lift": worst / total}
-    return dict(sorted(lifts.items(), key=lambda item: -item[1]["lift"]))
-
-
-def _mean_confidence(predictions: Sequence[Prediction]) -> float | None:
-    known = [prediction.confidence for prediction in predictions if prediction.confidence is not None]
-    return float(np.mean(known)) if known else None
 
 
 class _ReopenedRun:
@@ -149,7 +109,6 @@ class _ReopenedRun:
             weights = self._encoders.manifest.evidence_for(view=query.is_view)
             fit["true_cost"] = cost_of_pose(query, scene.plan, prediction.truth, weights)
             fit["found_cost"] = None if found is None else cost_of_pose(query, scene.plan, found, weights)
-            fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)
         (error_m,) = position_errors_m([prediction]).tolist()
         (first_m,) = position_errors_m([prediction], next(iter(prediction.stages), None)).tolist()
         (outcome,) = outcomes([prediction])
@@ -163,8 +122,6 @@ class _ReopenedRun:
             first_error_m=None if found is None else first_m,
             confidence=prediction.confidence,
             facts=prediction.facts,
-            symmetric=is_symmetric(scene.plan, prediction),
-            symmetric_by_chance=symmetric_by_chance(scene.plan, prediction),
             **fit,
         )
 
@@ -180,38 +137,3 @@ class _ReopenedRun:
                 scene=scene.name,
             )
         return scene, camera
-
-
-def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
-    """Return whether a misaligned pose in the right room fits the mirrored room, see `_symmetric_area`."""
-    pose = prediction.final_pose
-    if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
-        return False
-    return shapely.Point(pose.x_m, pose.y_m).within(_symmetric_area(plan, prediction))
-
-
-def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
-    """Return the share of the wrong positions in the true room for which `is_symmetric` holds."""
-    truth = prediction.truth
-    room = plan.rooms[truth.room_index].shape
-    wrong = room.difference(shapely.Point(truth.x_m, truth.y_m).buffer(ALIGNMENT_LIMIT_M))
-    return wrong.intersection(_symmetric_area(plan, prediction)).area / wrong.area if wrong.area > 0.0 else 0.0
-
-
-def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry:
-    """Return the surroundings of the true position mirrored along either axis of its room's box, and turned by 180°."""
-    truth = prediction.truth
-    left, bottom, right, top = plan.rooms[truth.room_index].shape.bounds
-    across, along = left + right - truth.x_m, bottom + top - truth.y_m
-    places = [(across, truth.y_m), (truth.x_m, along), (across, along)]
-    return shapely.union_all(shapely.points(places)).buffer(ALIGNMENT_LIMIT_M)
-
-
-def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
-    """Return the median over azimuths of the relative error of the predicted distance."""
-    assert query.profile is not None
-    log_m = query.profile.log_m[0]
-    # In the frame of the query's first hypothesis.
-    position_m, room, heading = truth.position_m[None], np.array([truth.room_index]), truth.heading - query.roll[0]
-    (true_m,) = profiles_at(scene.plan, position_m, room, np.array([heading]), len(log_m))
-    return float(np.expm1(np.median(log_m - np.log(true_m))))

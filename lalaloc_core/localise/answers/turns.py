@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from lalaloc_core.bundle import Bundle
@@ -153,15 +154,16 @@ class Turn:
     ) -> Generator[RefinementJob | None, Any, TurnLocalisation]:
         """Search the angles that are not known, then the place; see `search.pipeline.next_step`."""
         config = replace(config or LocaliseConfig(), vdr_candidates=0)
-        plan, grid, sphere = ground.plan, ground.grid, self.sphere
-        if sphere is None and self.turns is not None:
-            searched, query = SearchedTurn(list(self.turns)), queries[0]
-        else:
-            searched = yield from searched_turn(plan, grid, encoder.layouts, queries, self.relative, config.matching)
-            query = self.query(encoder, *self._joint_spot(searched.headings)) if sphere is None else queries[sphere]
-        found = yield from localise_steps(
-            plan, grid, encoder.layouts, query, refine=refine, top_k=top_k, config=config, clock=clock
-        )
+        parts, sphere = (ground.plan, ground.grid, encoder.layouts), self.sphere
+        query, searched = queries[sphere or 0], SearchedTurn(list(self.turns or ()))
+        search = partial(searched_turn, *parts, queries, self.relative, config.matching)
+        if sphere is None and self.turns is None:
+            searched = yield from search()
+            query = self.query(encoder, *self._joint_spot(searched.headings))
+        found = yield from localise_steps(*parts, query, refine=refine, top_k=top_k, config=config, clock=clock)
+        if sphere is not None:
+            # The sphere alone tells the place, so the headings of the others are searched there.
+            searched = yield from search(place=found.candidates[0])
         reference = searched.headings[sphere or 0]
         return TurnLocalisation(found, [angle - reference for angle in searched.headings], searched.contradicted)
 

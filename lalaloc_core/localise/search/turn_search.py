@@ -28,13 +28,13 @@ from lalaloc_core.localise.belief import area_shares, or_misread
 from lalaloc_core.localise.encode.layout_encoder import LayoutEncoder
 from lalaloc_core.localise.match import MatchingConfig, MatchingCost, PlaceCost, PoseGrid
 from lalaloc_core.localise.match.cost_terms import latent_distances
-from lalaloc_core.localise.query import NO_HINTS, Query
+from lalaloc_core.localise.query import NO_HINTS, Candidate, Query
 from lalaloc_core.localise.search.pipeline import Localisation, SearchStage
 from lalaloc_core.photograph.overlap import LIKELY_SD
 
-# Number of places whose headings are searched, the best by every n-th azimuth, with n = `_STRIDE`; and of pairs of a
-# place and a heading in memory, of all photographs.
-_MAX_PLACES, _MAX_PAIRS, _STRIDE = 2048, 1_310_720, 4
+# Number of places whose headings are searched, and of pairs of a place and a heading of all photographs. They are the
+# best by every n-th azimuth, n = `_STRIDE`, of so many photographs of the turn; near a known place there are `_NEAR`.
+_MAX_PLACES, _MAX_PAIRS, _STRIDE, _MAX_CHOOSING, _NEAR = 2048, 2**18, 4, 8, 16
 # Likelihood of a relative heading that is wrong, in units of that of an exact one, and the number of its standard
 # deviations beyond which it is said to be.
 _FLOOR, _CONTRADICTED = 1e-4, 4.0
@@ -99,8 +99,9 @@ def searched_turn(
     queries: Sequence[Query],
     relative: Sequence[RelativeHeading],
     matching: MatchingConfig,
+    place: Candidate | None = None,
 ) -> Generator[None, Any, SearchedTurn]:
-    """Search the relative headings of photographs of one spot; yields None where the search can pause."""
+    """Search relative headings of photographs of one spot, near their place if it is known; yields None in pauses."""
 
     def log_likelihood(query: Query, index: np.ndarray, stride: int = 1) -> Float[np.ndarray, "p k"]:
         """Return the log likelihood of some poses under each hypothesis, by every so many azimuths."""
@@ -116,10 +117,14 @@ def searched_turn(
 
     pairs = _MAX_PAIRS // sum(len(query.roll) for query in queries)
     index, most = np.arange(len(grid.poses)), max(min(_MAX_PLACES, pairs), 1)
-    if len(index) > most:
+    if place is not None:
+        index = np.flatnonzero(grid.poses.room_index == place.room_index)
+        distance_m = np.linalg.norm(grid.poses.position_m[index] - place.position_m, axis=1)
+        index = np.sort(index[distance_m.argsort()[:_NEAR]])
+    elif len(index) > most:
         total = np.zeros(len(index))
-        for query in queries:
-            total += log_likelihood(query, index, stride=_STRIDE).max(axis=1)
+        for number in np.linspace(0, len(queries) - 1, min(len(queries), _MAX_CHOOSING)).round().astype(int):
+            total += log_likelihood(queries[number], index, stride=_STRIDE).max(axis=1)
             yield None
         index = np.sort(np.argpartition(-total, most)[:most])
     seen = []

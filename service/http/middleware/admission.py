@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from typing import Any, cast
 
 from starlette.datastructures import Headers
@@ -19,7 +19,7 @@ from service.errors import DeadlineExceededError, OverloadedError, StoppingError
 from service.http.problems import problem_answer
 from service.http.uploads import ending_request
 from service.security.access_control import routed_path
-from service.security.permissions import caller_of
+from service.security.permissions import OPEN_PATHS, caller_of
 
 # Bytes of a query's body that arrive without a rest, and the time (s) that the server takes to receive a byte.
 _FREE_BYTES, _RECEIVING_S = 8 * 2**20, 5e-9
@@ -65,6 +65,9 @@ class AdmissionMiddleware:
 
     def _class_of(self, scope: Scope) -> RouteClass:
         method, path = scope["method"], routed_path(scope)
+        if path in OPEN_PATHS:
+            # Nobody is known to be the caller of any method.
+            return PROBE
         for route, declared in self._declared:
             if method in (route.methods or ()) and route.path_regex.match(path):
                 return declared
@@ -74,7 +77,7 @@ class AdmissionMiddleware:
         self, admission: Admission, route_class: RouteClass, client: str, scope: Scope, receive: Receive, send: Send
     ) -> None:
         rests = _Rests(admission.cpu_accounts, client, query=route_class.is_query)
-        permit = scope[_SCOPE_KEY] = _ReadPermit(admission.reading, client, rests)
+        permit = scope[_SCOPE_KEY] = ReadPermit(admission.reading, client, rests)
         stated = Headers(scope=scope).get("content-length", "")
         body = _BodyBudget(admission.bytes_in_flight, client, int(stated) if stated.isdecimal() else None)
         connection = _Connection(receive, send, body, rests, on_answer=permit.end)
@@ -101,10 +104,9 @@ class AdmissionMiddleware:
                 admission.cpu_accounts.refuse(client, _REFUSED_S + rests.spent_s)
 
 
-def reading(scope: Scope) -> AbstractAsyncContextManager[None]:
-    """Return a block in which a request holds a permit to read, for answers that are read part by part."""
-    permit: _ReadPermit = scope[_SCOPE_KEY]
-    return permit.for_a_part()
+def read_permit(scope: Scope) -> ReadPermit:
+    """Return the permit to read of a request."""
+    return scope[_SCOPE_KEY]
 
 
 class _Rests:
@@ -142,7 +144,7 @@ class _Rests:
         await self.take()
 
 
-class _ReadPermit:
+class ReadPermit:
     """Permit to compute the answer to a read, of which a request holds at most one."""
 
     def __init__(self, semaphore: FairSemaphore, client: str, rests: _Rests) -> None:
@@ -167,12 +169,22 @@ class _ReadPermit:
 
     @asynccontextmanager
     async def for_a_part(self) -> AsyncIterator[None]:
-        """Hold the permit during the block, which is no wait while the request holds it already."""
+        """Hold the permit for a part of the answer, which is no wait while the request holds it already."""
         if self._is_held:
             yield
             return
         async with self._semaphore.held(self._client):
             yield
+
+    @asynccontextmanager
+    async def away(self) -> AsyncIterator[None]:
+        """Give the permit back while the request waits for a worker, so that others of its client read."""
+        was_held = self._is_held
+        self.end()
+        yield
+        if was_held:
+            await self._semaphore.acquire(self._client)
+            self._is_held = True
 
     def end(self) -> None:
         """Give the permit back, once."""
