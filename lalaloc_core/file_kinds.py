@@ -185,4 +185,7 @@ def is_drawing(picture: UInt8[np.ndarray, "h w 3"]) -> bool:
     if not is_even and counts[max(frequent - 6, 0) : frequent + 7].sum() < _MIN_SAMPLED * counts.sum():
         return False
     tones = Tones.of(np.asarray(Image.fromarray(picture).convert("L")))
+    # Plans and texts can be light on dark. Dark photographs have few edges.
+    if tones is not None and not tones.is_drawing and tones.edges >= _MIN_EDGES:
+        tones = Tones.of(np.asarray(Image.fromarray(255 - picture).convert("L")))
     return tones is not None and tones.is_drawing

@@ -53,12 +53,12 @@ _SD, _CROPPED_SD = 0.03, 0.06
 MAX_NAME = 60
 # The farthest time zones from UTC, in minutes.
 _MAX_OFFSET_MIN = 14 * 60
-# Times as cameras and editors write them: "2024:05:01 10:20:30", "2024-05-01T10:20:30.5+02:00", "2024/5/1 3:20 PM".
-_AFTERNOON, _MORNING = "下午 午後 오후 p.m. pm", "上午 午前 오전 a.m. am"
-_HALVES = "|".join(re.escape(word) for word in f"{_AFTERNOON} {_MORNING}".split())
+# Times as cameras and editors write them: "2024:05:01 10:20:30", "2024-05-01T10:20:30.5+02:00", "2024/5/1 3:20 p. m.".
+_AFTERNOON, _MORNING = "下午 午後 오후 pm ch μμ م", "上午 午前 오전 am sa πμ ص"
+_HALVES = "|".join(r"\.? ?".join(half) + r"\.?" for half in f"{_AFTERNOON} {_MORNING}".split())
 _TIME = re.compile(
-    rf"(\d{{4}})[:./-](\d{{1,2}})[:./-](\d{{1,2}})[T ,]+({_HALVES})? *(\d{{1,2}})[:.](\d{{2}})(?:[:.](\d{{2}}))?"
-    rf"(?:[.,](\d{{1,6}})\d*)? *({_HALVES})? *(Z|[+-]\d{{2}}:?\d{{2}})?",
+    rf"(\d{{4}})[:./-] ?(\d\d?)[:./-] ?(\d\d?)[T ,]+({_HALVES})? *(\d\d?)[:.] ?(\d\d?)(?:[:.] ?(\d\d?))?"
+    rf"(?:[.,](\d{{1,6}})\d*)? *({_HALVES})? *(Z|UTC|GMT|[+-]\d\d?(?::?\d\d)?)?",
     re.IGNORECASE,
 )
 _TIMES = (
@@ -245,7 +245,7 @@ def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | N
     if found is None:
         return None
     year, month, day, before, hour, minute, second, digits, after, zone = found.groups()
-    half = (before or after or "").casefold()
+    half = re.sub(r"[. ]", "", before or after or "").casefold()
     hours = int(hour) % 12 + 12 * (half in _AFTERNOON.split()) if half else 0 if hour == "24" else int(hour)
     fraction = (digits or subseconds)[:6].ljust(6, "0")
     microsecond = int(fraction) if fraction.isascii() and fraction.isdigit() else 0
@@ -259,10 +259,10 @@ def read_time(text: str, subseconds: str = "", offset: str = "") -> datetime | N
 
 def _zone(offset: str) -> timezone | None:
     """Return a time zone such as "+02:00" or "Z"; None for none, or one that is none."""
-    found = re.fullmatch(r"([+-])(\d{2}):?(\d{2})", offset.strip())
+    found = re.fullmatch(r"([+-])(\d\d??)(?::?(\d\d))?", offset.strip())
     if found is None:
-        return UTC if offset.strip().upper() == "Z" else None
-    minutes = 60 * int(found[2]) + int(found[3])
+        return UTC if offset.strip().upper() in ("Z", "UTC", "GMT") else None
+    minutes = 60 * int(found[2]) + int(found[3] or 0)
     return timezone(timedelta(minutes=-minutes if found[1] == "-" else minutes)) if minutes <= _MAX_OFFSET_MIN else None
 
 

@@ -229,11 +229,8 @@ def _find_bars(thumbnail: Thumbnail) -> SphereFormat | None:
     across, down = (right - left) / width, (bottom - top) / height
     exact = (1.0, width / 2.0 / height) if across > 0.98 else (2.0 * height / width, 1.0)
     slack = 2.5 / min(height, width)
-    if max(abs(exact[0] - across), abs(exact[1] - down), abs(left + right - width) / width) > slack:
-        return None
-    if abs(top + bottom - height) / height > slack or max(exact) > 1.0 + slack:
-        return None
-    if not looks_spherical(pixels[top:bottom, left:right]):
+    off = exact[0] - across, exact[1] - down, (left + right) / width - 1.0, (top + bottom) / height - 1.0
+    if max(map(abs, off)) > slack or max(exact) > 1.0 + slack or not looks_spherical(pixels[top:bottom, left:right]):
         return None
     beside, above = 0.5 * (1.0 - min(exact[0], 1.0)), 0.5 * (1.0 - min(exact[1], 1.0))
     share = 1.0 - (1.0 - 2.0 * beside) * (1.0 - 2.0 * above)
@@ -285,7 +282,7 @@ def _between_bars(pictures: UInt8[np.ndarray, "f n m 3"], *, is_within: bool, is
     Bars have one colour, beside texts, buttons and strips of small pictures, or are a gradient or a blurred copy of the
     picture.
     """
-    ends = pictures, pictures[:, ::-1]
+    ends, rows = (pictures, pictures[:, ::-1]), pictures.shape[1]
     (top, colour), (bottom, other) = (_plain_rows(end, 2.0 * _MAX_BAR_SPREAD) for end in ends)
     is_alike = top and bottom and np.abs(colour - other).max() <= 2.0 * _MAX_BAR_SPREAD
     if not is_alike and not (is_within and (top or bottom)):
@@ -295,8 +292,8 @@ def _between_bars(pictures: UInt8[np.ndarray, "f n m 3"], *, is_within: bool, is
             top, bottom = (_plain_rows(end, _EXACT_SPREAD)[0] for end in ends)
         if not top and not bottom:
             top = bottom = _blurred_rows(greys)
-    mixed = 0 if is_exact else 1
-    return top + mixed * (top > 0), pictures.shape[1] - bottom - mixed * (bottom > 0)
+    begin, end = top + (top > 0 and not is_exact), rows - bottom - (bottom > 0 and not is_exact)
+    return (begin, end) if begin < end else (0, rows)
 
 
 def _graded_rows(greys: UInt8[np.ndarray, "f n m"]) -> tuple[int, int]:

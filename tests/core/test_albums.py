@@ -197,10 +197,10 @@ def test_photograph_of_an_album_that_fits_badly_is_uncertain_and_not_set_aside(
     memory, kitchen = solved[1], photographs[0]
     states = States.of(memory.evidence[kitchen.id], encoder().manifest.ring_sectors)
     rooms = len(ground.plan.rooms)
-    share = np.append(np.full(rooms, 0.3 / rooms), 0.7)
+    share = np.append(np.full(rooms, 1e-4), 1.0 - 1e-4 * rooms)
     pins = [_pin_of(ground, kitchen, states, share, None, fits=fits, is_outside=False) for fits in (True, False)]
     assert [pin.state for pin in pins] == ["set_aside", "uncertain"]
-    assert pins[1].confidence == pytest.approx(0.3 / rooms)
+    assert pins[1].confidence == pytest.approx(1e-4)
 
 
 def test_album_that_fits_badly_says_so_and_has_no_sure_pin(

@@ -26,7 +26,7 @@ PHOTOGRAPHS = sorted([*EXAMPLES.glob("*.jpg"), *EXAMPLES.glob("real/*.jpg")])
 def test_photographs_are_not_taken_for_drawings() -> None:
     pictures = [np.asarray(Image.open(path).convert("RGB")) for path in PHOTOGRAPHS]
     assert len(pictures) > 5
-    assert not any(map(is_drawing, pictures))
+    assert not any(map(is_drawing, [*pictures, *(picture // 4 for picture in pictures)]))
 
 
 @pytest.mark.parametrize("shade", [255, 128, 0])
@@ -67,7 +67,8 @@ def test_plans_with_coloured_rooms_are_drawings(style: Style) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_scanned_plans_are_drawings(seed: int) -> None:
-    assert is_drawing(np.asarray(Image.open(io.BytesIO(draw_plan("scanned", seed).jpeg())).convert("RGB")))
+    picture = np.asarray(Image.open(io.BytesIO(draw_plan("scanned", seed).jpeg())).convert("RGB"))
+    assert all(map(is_drawing, (picture, 255 - picture)))
 
 
 @pytest.mark.parametrize("name", ["real/hotel_room.jpg", "phone.jpg", "turn_1.jpg", "kitchen.jpg"])
@@ -90,8 +91,7 @@ def test_plan_given_as_a_photograph_is_refused(stated: StatedCamera | None) -> N
 
 def test_errors_name_a_page_of_text() -> None:
     prose = [Lettering("The tenant pays the rent until the third day", (0.0, 20.0 * line)) for line in range(20)]
-    (hint,) = text_hints(prose, "the picture")
-    assert hint.startswith("the picture is a page of text with 20 lines")
+    assert [hint[:43] for hint in text_hints(prose, "the picture")] == ["the picture is a page of text with 20 lines"]
     labels = [Lettering(name, (0.0, 0.0)) for name in ("Kitchen", "Hall", "4.20")] * 10
     assert text_hints([*labels, *prose[:9]], "the picture") == []
 

@@ -273,7 +273,8 @@ def test_room_type_from_label() -> None:
         ("K/F", "kitchen living"), ("LDK 15.2", "living dining kitchen"), ("Kitchen & Dining Room", "kitchen dining"),
         ("Sala de jantar / cozinha", "dining kitchen"), ("Salon salle à manger", "living dining"),
         ("リビング・ダイニング", "living dining"), ("Bath / laundry", "bathroom laundry"), ("W/C", "bathroom"),
-        ("Bedroom closet", "bedroom"), ("Salon z aneksem", "living kitchen"), ("Bedroom and office", "bedroom office"),
+        ("Recámara 2", "bedroom"), ("Salon z aneksem", "living kitchen"), ("Bedroom and office", "bedroom office"),
+        ("Bedroom closet", "bedroom"), ("Ruokailu", "dining"), ("OH+K", "kitchen living"), ("Great Room", "living"),
     ],
 )  # fmt: skip
 def test_name_of_a_room_gives_its_types(name: str, types: str) -> None:

@@ -15,7 +15,7 @@ from PIL import ExifTags, Image
 from lalaloc_core.errors import InvalidPhotographError
 from lalaloc_core.photograph.cameras import Fisheye, Perspective
 from lalaloc_core.photograph.picture_files import PhotographLimits, opened_picture
-from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format
+from lalaloc_core.photograph.sphere_formats import THUMBNAIL_SIDE, Thumbnail, find_sphere_format, inside_bars
 from tests.core.taken import jpeg, opened, sphere, take, within_bars
 from tests.core.test_photo_sphere import crop, encoded, xmp
 from tests.painted import picture_file
@@ -201,8 +201,7 @@ class TestParts:
         assert views[1].compass_heading == pytest.approx(math.radians(200.0))
         assert views[0].azimuths == pytest.approx((-math.pi * 600 / 1024, math.pi * 600 / 1024))
         # The seen part is in the middle: the border is neutral on both sides.
-        assert views[0].sphere is not None
-        seen = np.flatnonzero((views[0].sphere[64] != 128).any(axis=-1))
+        seen = np.flatnonzero((present(views[0].sphere)[64] != 128).any(axis=-1))
         assert abs(seen[0] + seen[-1] - 255) <= 2
 
     def test_part_beyond_the_seam_is_refused(self) -> None:
@@ -226,11 +225,12 @@ def test_photograph_is_taken_out_of_its_bars(kind: str) -> None:
     found = opened(picture_file(within_bars(view, kind)))
     assert found.projection == "perspective"
     assert "% of the picture, as in a screenshot" in found.warnings[0]
-    assert found.camera is not None
-    assert (found.camera.width, found.camera.height) == pytest.approx((640, 400), abs=5)
+    assert (present(found.camera).width, present(found.camera).height) == pytest.approx((640, 400), abs=5)
 
 
-def test_black_zenith_and_nadir_are_of_the_sphere() -> None:
+def test_black_zenith_and_nadir_and_a_single_edge_are_no_bars() -> None:
+    edge = np.full((480, 360, 3), 235, np.uint8) * (np.arange(480) > 80)[:, None, None].astype(np.uint8)
+    assert inside_bars(edge[None]) == ((0, 480), (0, 360))
     pixels = small("kitchen").copy()
     pixels[:60] = pixels[-60:] = 0
     for view in (opened(jpeg(pixels)), opened(jpeg(pixels), projection="equirectangular")):

@@ -138,15 +138,14 @@ def test_numbers_in_names_order_photographs_whose_neighbours_are_alike(
     [
         ("2024:05:01 10:20:30", datetime(2024, 5, 1, 10, 20, 30)),
         ("2024-05-01 10:20:30", datetime(2024, 5, 1, 10, 20, 30)),
+        ("2024:05: 1  9: 3: 5", datetime(2024, 5, 1, 9, 3, 5)),
+        ("2024:05:01 03:14:12 p. m.", datetime(2024, 5, 1, 15, 14, 12)),
         ("2024/5/1 3:20 PM", datetime(2024, 5, 1, 15, 20)),
         ("2024-05-01T10:20:30.5+02:00", datetime(2024, 5, 1, 8, 20, 30, 500_000, tzinfo=UTC)),
-        ("2024:05:01 10:20:30Z", datetime(2024, 5, 1, 10, 20, 30, tzinfo=UTC)),
+        ("2024:05:01 10:20:30 UTC", datetime(2024, 5, 1, 10, 20, 30, tzinfo=UTC)),
         ("2024:05:01 下午 03:14:12", datetime(2024, 5, 1, 15, 14, 12)),
         ("2024:05:01 24:05:12", datetime(2024, 5, 1, 0, 5, 12)),
-        ("0000:00:00 00:00:00", None),
-        ("    :  :     :  :  ", None),
-        ("2024:13:01 10:20:30", None),
-        ("2024:05:01", None),
+        *((text, None) for text in ("0000:00:00 00:00:00", "    :  :     :  :  ", "2024:13:01 10:20:30", "2024:05:01")),
     ],
 )
 def test_times_are_read_in_the_forms_of_cameras(text: str, expected: datetime | None) -> None:
@@ -154,8 +153,8 @@ def test_times_are_read_in_the_forms_of_cameras(text: str, expected: datetime | 
 
 
 def test_zone_and_fraction_of_a_time_can_be_tags_of_their_own() -> None:
-    found = read_time("2024:05:01 10:20:30", "25", "-03:30")
-    assert found == datetime(2024, 5, 1, 13, 50, 30, 250_000, tzinfo=UTC)
+    assert read_time("2024:05:01 10:20:30", "25", "-03:30") == datetime(2024, 5, 1, 13, 50, 30, 250_000, tzinfo=UTC)
+    assert len({read_time("2024:05:01 10:20:30", "", zone) for zone in ("+2", "+0200", "+02:00")}) == 1
     assert read_time("2024:05:01 10:20:30", "", "+99:00") == datetime(2024, 5, 1, 10, 20, 30)
 
 

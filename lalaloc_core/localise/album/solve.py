@@ -51,6 +51,8 @@ _MISFIT_WARNING = (
     "other homes, so none is sure; check that it is the plan of this home, its scale, and that it draws the doors and "
     "windows"
 )
+_ELSEWHERE = "it fits none of the rooms of the plan better than rooms of other buildings"
+_OUTSIDE = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"
 _CERTAIN = 1e4
 
 
@@ -272,7 +274,8 @@ def _pin(
 ) -> Pin:
     """Return the pin of a photograph by the probabilities of its rooms."""
     rooms = len(ground.plan.rooms)
-    order = [int(room) for room in np.argsort(-share[:rooms], kind="stable")[:_ROOMS] if share[room] > 1e-3]
+    ranked = np.argsort(-share[:rooms], kind="stable")[:_ROOMS].tolist()
+    order = ranked[:1] + [room for room in ranked[1:] if share[room] > 1e-3]
     choices = [
         Suggestion(
             pose=ground.pose(states.position_m[row], room, float(states.heading[row])),
@@ -301,10 +304,7 @@ def _pin(
     # Photographs of a home that is read badly fit elsewhere better, all of them.
     is_elsewhere = share[rooms] > 0.5 and (fits or is_outside)
     if is_elsewhere or not suggestions:
-        reason = "it fits none of the rooms of the plan better than rooms of other buildings"
-        if is_outside:
-            reason = "no furniture or fittings are recognised in it, as in photographs of façades and gardens"
-        return replace(base, state="set_aside", reason=reason)
+        return replace(base, state="set_aside", reason=_OUTSIDE if is_outside else _ELSEWHERE)
     confidence = float(share[order[0]])
     is_sure = fits and confidence >= SURE
     also = ", ".join(f"{row.room} {100.0 * row.probability:.0f} %" for row in listed[1:3] if row.probability >= 0.005)
