@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     )
     from lalaloc_core.errors import LaLaLocError
 
-__version__ = "0.17.0"
+__version__ = "0.18.0"
 __all__ = [
     "Answer", "FloorPlan", "LaLaLoc", "LaLaLocError", "Odometry", "PinnedAlbum", "StatedCamera", "Track",
     "TrackedAnswer", "TurnAnswer", "read_plan",
