@@ -359,8 +359,8 @@ def _coefficient(pieces: Float[np.ndarray, "k 2 2"]) -> tuple[float, float, floa
     length, distance = float(np.ptp(along)), float(middle @ axes[1])
     if length < _SHORTEST or abs(distance) < _OFF_CENTRE:
         return None
-    # A parabola across the chain: its bend is away from the centre if it has the sign of `distance`. The regression
-    # on what a line leaves of the squares gives its coefficient, and takes a tenth of the time of `np.polyfit`.
+    # A parabola across the chain: its bend is away from the centre if it has the sign of `distance`. By regression on
+    # what a line leaves of the squares, in a tenth of the time of `np.polyfit`.
     squares = along * along
     squares -= squares.mean() + (squares @ along) / (along @ along) * along
     curve = (squares @ across) / (squares @ squares)

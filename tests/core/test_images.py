@@ -195,7 +195,7 @@ class TestScans:
     @pytest.mark.slow
     @pytest.mark.parametrize("unit", [b"\xff\x00", b"\xff\xff", b"\xff\xd0", b"\xff\x01", b"\xff\xe0\0\2", b"\0"])
     def test_scan_count_takes_linear_time(self, unit: bytes) -> None:
-        def count(size: int) -> Callable[[], int]:
+        def count(size: int) -> Callable[[], object]:
             content = b"\xff\xd8\xff\xda\0\2" + unit * (size // len(unit))
             return lambda: count_scans(content, 20)
 

@@ -155,13 +155,13 @@ class MatchingCost:
         self._plan, self._query, self._reach_m = plan, query, reach_m
         self._weights, self._config, self._stride = weights, config, stride
         first, rival = query.profile, query.profile.rival
-        values = [first.log_m, first.log_scale, np.ones_like(first.log_m)]
-        values += [] if rival is None else [rival.log_m, rival.log_scale, rival.odds]
+        modes = [(first.log_m, first.log_scale, np.ones_like(first.log_m))]
+        modes += [] if rival is None else [(rival.log_m, rival.log_scale, rival.odds)]
         # Hypotheses are mostly one prediction, turned, of which everything is computed once.
-        self._turned = self._turned_columns(np.stack(values, axis=2)) if stride == 1 else None
-        values = values if self._turned is None else [value[:1] for value in values]
-        modes = (values[index : index + 3] for index in range(0, len(values), 3))
-        self._turning = [WallMode.of(*mode, reach_m, weights.tail, stride) for mode in modes]
+        values = np.array(modes).reshape(-1, *first.log_m.shape).transpose(1, 2, 0)
+        self._turned = self._turned_columns(values) if stride == 1 else None
+        own, rest = slice(None if self._turned is None else 1), (reach_m, weights.tail, stride)
+        self._turning = [WallMode.of(log_m[own], scale[own], odds[own], *rest) for log_m, scale, odds in modes]
         self._modes = [mode if self._turned is None else mode.turned(self._turned) for mode in self._turning]
         self._first = self._modes[0]
 
