@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 # Limits of lines and files. They may only be lowered.
-LIMITS = {"lines of Python": 95_372, "files of Python": 550, "lines of TypeScript": 10_661, "lines of tests": 48_536}
+LIMITS = {"lines of Python": 95_371, "files of Python": 550, "lines of TypeScript": 10_657, "lines of tests": 48_534}
 # The client that blocks is generated from the one that does not.
 _GENERATED = "lalaloc_client/blocking/*"
 _NOT_SOURCES = {".venv", "build", "data", "runs"}
