@@ -178,9 +178,9 @@ def _circle_parts() -> tuple[Bool[np.ndarray, "s s"], Int[np.ndarray, "s s"]]:
 
 
 def _find_stereo(thumbnail: Thumbnail) -> SphereFormat | None:
-    """Return the format of a picture of two eyes, each with a sphere or 180° of it; photographs of 4:3 are none."""
+    """Return the format of a picture of two eyes, each with a sphere or 180° of it; 4:3 and 3:2 are of none."""
     pixels = thumbnail.pixels
-    if _has_ratio(pixels, 4.0 / 3.0) or _has_ratio(pixels, 0.75):
+    if any(_has_ratio(pixels, ratio) for ratio in (4.0 / 3.0, 0.75, 1.5, 2.0 / 3.0)):
         return None
     # Made small once for both ways, as that takes longest.
     small = cv2.resize(thumbnail.grey, (2 * _EYE[1], 2 * _EYE[0]), interpolation=cv2.INTER_AREA)
